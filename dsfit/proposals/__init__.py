@@ -1,0 +1,52 @@
+"""Proposals: what draws an incident direction, and the density it draws with."""
+
+from dsfit.proposals.adapters import FromDensity, TorchDistribution
+from dsfit.proposals.azimuth import CosineHalf, Scattered, TruncatedGaussian, WrappedGaussian
+from dsfit.proposals.base import Azimuthal, Distribution, Longitudinal, Product, Proposal
+from dsfit.proposals.cauchy_lobe import CauchyLobe
+from dsfit.proposals.chapter import FrozenAverages, chapter_proposals
+from dsfit.proposals.gaussian_lobe import BoxMullerLobe, GaussianLobe
+from dsfit.proposals.lobe import Lobe
+from dsfit.proposals.mixture import Mixture, MixtureDistribution
+from dsfit.proposals.scattered_lobe import BackScatterLobe, ScatteredLobe
+from dsfit.proposals.transmittance import TransmittanceCosine, TransmittanceGaussian
+from dsfit.proposals.uniform import (
+    BackHalf,
+    FrontHalf,
+    FrontHemisphere,
+    UniformAzimuth,
+    UniformInclination,
+    UniformSphere,
+)
+
+__all__ = [
+    "Azimuthal",
+    "BackHalf",
+    "BackScatterLobe",
+    "BoxMullerLobe",
+    "CauchyLobe",
+    "CosineHalf",
+    "Distribution",
+    "FromDensity",
+    "FrontHalf",
+    "FrontHemisphere",
+    "FrozenAverages",
+    "GaussianLobe",
+    "Lobe",
+    "Longitudinal",
+    "Mixture",
+    "MixtureDistribution",
+    "Product",
+    "Proposal",
+    "Scattered",
+    "ScatteredLobe",
+    "TorchDistribution",
+    "TransmittanceCosine",
+    "TransmittanceGaussian",
+    "TruncatedGaussian",
+    "UniformAzimuth",
+    "UniformInclination",
+    "UniformSphere",
+    "WrappedGaussian",
+    "chapter_proposals",
+]

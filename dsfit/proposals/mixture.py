@@ -1,0 +1,168 @@
+"""Mixtures of proposals with learnable weights and a defensive share of the uniform sphere."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from dsfit.context import Context
+from dsfit.errors import InputError, check_range
+from dsfit.proposals.base import Distribution, Proposal
+from dsfit.proposals.parameters import Constrained
+from dsfit.proposals.uniform import UniformSphere
+
+
+def log_sum_exp(x: Tensor) -> Tensor:
+    """log sum exp over the last dimension; -inf entries are allowed, and so are rows of them, with zero gradient."""
+    top = x.detach().amax(dim=-1, keepdim=True)
+    top = torch.where(torch.isinf(top), 0.0, top)
+    total = torch.exp(x - top).sum(dim=-1)
+    empty = total == 0
+    return torch.where(empty, -math.inf, torch.log(torch.where(empty, 1.0, total)) + top[..., 0])
+
+
+class MixtureDistribution(Distribution):
+    """`p = sum_k w_k p_k` of distributions over the same contexts.
+
+    Args:
+        components: the p_k.
+        log_weights: log w_k, `[K]` or `[*batch, K]`, normalised by the caller.
+
+    The first uniform selects the component, the others are its own; `dimension = 1 + max_k dimension_k`. A component
+    is sampled only where it was selected, if it supports `select`; otherwise everywhere. Samples are differentiable
+    in the parameters of the
+    selected component, not in the weights: selection is a step function.
+    """
+
+    def __init__(self, components: Sequence[Distribution], log_weights: Tensor) -> None:
+        self.components, self.log_weights = list(components), log_weights
+        self.batch_shape = self.components[0].batch_shape
+        self.dimension = 1 + max(c.dimension for c in self.components)
+
+    def component_log_probs(self, omega: Tensor) -> Tensor:
+        """log p_k `[..., K]` of every component."""
+        return torch.stack(torch.broadcast_tensors(*(c.log_prob(omega) for c in self.components)), dim=-1)
+
+    def log_prob(self, omega: Tensor) -> Tensor:
+        return log_sum_exp(self.component_log_probs(omega) + self.log_weights)
+
+    def selected(self, u: Tensor) -> Tensor:
+        """Index of the component that the uniform `u[...]` selects."""
+        edges = torch.exp(self.log_weights.detach()).cumsum(dim=-1)[..., :-1]
+        return (u[..., None] >= edges).sum(dim=-1)
+
+    def sample(self, u: Tensor) -> Tensor:
+        choice = self.selected(u[..., 0])
+        try:
+            # Under vmap sizes cannot depend on data.
+            where = [torch.nonzero((choice == k).flatten())[:, 0] for k in range(len(self.components))]
+        except RuntimeError:
+            return self._sample_everywhere(u, choice)
+        flat = u.reshape(-1, u.shape[-1])
+        whole: dict[int, Tensor] = {}
+        parts = []
+        for k, (component, index) in enumerate(zip(self.components, where, strict=True)):
+            if len(index) == 0:
+                continue
+            restricted = self._restrict(component, index)
+            if restricted is None:
+                whole[k] = component.sample(u[..., 1 : 1 + component.dimension])
+                parts.append(whole[k].reshape(-1, 2)[index])
+            else:
+                parts.append(restricted.sample(flat[index, 1 : 1 + component.dimension]))
+        order = torch.cat(where)
+        back = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
+        return torch.cat(parts)[back].reshape(*choice.shape, 2)
+
+    def _restrict(self, component: Distribution, index: Tensor) -> Distribution | None:
+        """The component for the flat sample indices `index` `[N]`, as a distribution with batch shape `[N]`."""
+        if len(self.batch_shape) == 0:
+            return component
+        element = index % self.batch_shape.numel()  # context dimensions are the last ones
+        return component.select(lambda t: t if t.dim() == 0 else t.expand(self.batch_shape).reshape(-1)[element])
+
+    def _sample_everywhere(self, u: Tensor, choice: Tensor) -> Tensor:
+        drawn = [c.sample(u[..., 1 : 1 + c.dimension]) for c in self.components]
+        result = drawn[0]
+        for k, omega in enumerate(drawn[1:], start=1):
+            result = torch.where((choice == k)[..., None], omega, result)
+        return result
+
+    def sample_with_log_prob(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        omega = self.sample(u)
+        return omega, self.log_prob(omega)
+
+    def select(self, take: Callable[[Tensor], Tensor]) -> MixtureDistribution | None:
+        components = [c.select(take) for c in self.components]
+        if any(c is None for c in components):
+            return None
+        weights = self.log_weights
+        if weights.dim() > 1:
+            weights = torch.stack([take(column) for column in weights.unbind(-1)], dim=-1)
+        return MixtureDistribution(components, weights)
+
+
+class Mixture(Proposal):
+    """Mixture with learnable weights: `p = (1 - defensive) sum_k softmax(logits)_k p_k + defensive / (4 pi)`.
+
+    The defensive share of the uniform sphere bounds every weight `f / p` by `4 pi f / defensive` (FORMULAS E11):
+    Gaussian lobes have lighter tails than the BSDF, and f^2 / p is only integrable where the tails of p dominate.
+
+    Args:
+        components: proposals.
+        weights: initial weights, positive, `[K]` or `[*batch, K]`; normalised; equal if left out.
+        defensive: share of the uniform sphere, in [0, 1).
+        learnable: whether `parameters()` lists the logits. Bijection: softmax.
+
+    Raises:
+        InputError: no component, weights of the wrong number or not positive, defensive out of range.
+    """
+
+    logits: Tensor
+
+    def __init__(
+        self,
+        components: Sequence[Proposal],
+        weights: Sequence[float] | Tensor | None = None,
+        defensive: float = 0.05,
+        *,
+        learnable: bool = True,
+    ) -> None:
+        super().__init__()
+        if not components:
+            raise InputError("components", components, "at least one proposal")
+        if not 0 <= defensive < 1:
+            raise InputError("defensive", defensive, "numbers in [0, 1)")
+        given = torch.ones(len(components)) if weights is None else torch.as_tensor(weights)
+        given = check_range("weights", given.detach().to(torch.float64), 0.0, open_low=True)
+        if given.dim() == 0 or given.shape[-1] != len(components):
+            raise InputError("weights", tuple(given.shape), f"one weight for each of {len(components)} components")
+        self.components = nn.ModuleList(components)
+        self.defensive = float(defensive)
+        self.sphere = UniformSphere()
+        logits = torch.log(given / given.sum(dim=-1, keepdim=True))
+        if learnable:
+            self.logits = nn.Parameter(logits)
+        else:
+            self.register_buffer("logits", logits)
+        self.learnable = learnable
+
+    def weights(self) -> Tensor:
+        """Weights of the components, `[..., K]`; they sum to 1 - defensive."""
+        return (1 - self.defensive) * torch.softmax(self.logits, dim=-1)
+
+    def own_constrained(self) -> Constrained:
+        """The weights with bounds 0 and 1 - defensive."""
+        return {"weights": (self.weights(), 0.0, 1 - self.defensive)} if self.learnable else {}
+
+    def forward(self, context: Context) -> MixtureDistribution:
+        log_weights = torch.log_softmax(self.logits, dim=-1) + math.log1p(-self.defensive)
+        parts = [component(context) for component in self.components]
+        if self.defensive > 0:
+            share = torch.full_like(log_weights[..., :1], math.log(self.defensive))
+            log_weights = torch.cat([log_weights, share], dim=-1)
+            parts.append(self.sphere(context))
+        return MixtureDistribution(parts, log_weights.to(context.dtype))
