@@ -1,0 +1,21 @@
+"""What surrounds a shading point: lights, scattering fibres, and images on disk."""
+
+from __future__ import annotations
+
+from dsfit.scene.exr import ExrImage, read_exr, write_exr
+from dsfit.scene.lights import ConstantLight, EnvironmentLight, Light, VonMisesFisherLights
+from dsfit.scene.scattering import ConstantScattering, Scattering, SlabScattering, SphereScattering
+
+__all__ = [
+    "ConstantLight",
+    "ConstantScattering",
+    "EnvironmentLight",
+    "ExrImage",
+    "Light",
+    "Scattering",
+    "SlabScattering",
+    "SphereScattering",
+    "VonMisesFisherLights",
+    "read_exr",
+    "write_exr",
+]

@@ -1,0 +1,158 @@
+"""What every light is: radiance as a function of omega_i, a proposal that samples it, where quadrature must break."""
+
+from __future__ import annotations
+
+import copy
+import math
+from abc import ABC, abstractmethod
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from dsfit.context import Context
+from dsfit.errors import InputError, check_finite
+from dsfit.frame import HALF_PI, to_angles, to_vector, wrap
+from dsfit.proposals.base import Distribution, Proposal
+
+
+def as_tensor(field: str, value: Any) -> Tensor:
+    """A floating-point tensor: tensors keep their dtype, everything else becomes float64; `InputError` if it cannot."""
+    if isinstance(value, Tensor) and value.is_floating_point():
+        return value
+    try:
+        return torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(field, value, "numbers, a rectangular list of numbers, or a tensor") from error
+
+
+def check_rotation(rotation: Any) -> Tensor | None:
+    """A rotation matrix `[*batch, 3, 3]` (world -> fibre) or None; raises `InputError` for anything else.
+
+    Orthonormality is asked for to 1e-4, which float32 matrices meet.
+    """
+    if rotation is None:
+        return None
+    matrix = check_finite("rotation", as_tensor("rotation", rotation))
+    if matrix.shape[-2:] != (3, 3):
+        raise InputError("rotation", tuple(matrix.shape), "shape [..., 3, 3]")
+    data = matrix.detach().to(torch.float64)
+    defect = (data @ data.mT - torch.eye(3, dtype=data.dtype, device=data.device)).abs().amax()
+    if defect > 1e-4 or (torch.linalg.det(data) < 0).any():
+        raise InputError("rotation", matrix.detach().tolist(), "orthonormal matrices with determinant +1")
+    return matrix
+
+
+class Light(nn.Module, ABC):
+    """Incident radiance L(omega_i), in the fibre frame: `light(omega_i [..., 2]) -> [..., C]`, in the dtype of omega_i.
+
+    Args:
+        rotation: matrix R `[3, 3]`, or `[*batch, 3, 3]` with one fibre frame per context, that takes directions from
+            the frame in which the light was described ("world") to the fibre frame: `w_fibre = R w_world`. None: the
+            two are the same. Batch dimensions are aligned on the right with those of omega_i, as those of a `Context`
+            are.
+    """
+
+    channels: int
+    """C, the number of colour channels."""
+    rotation: Tensor | None
+
+    def __init__(self, rotation: Any = None) -> None:
+        super().__init__()
+        self.register_buffer("rotation", check_rotation(rotation))
+
+    @abstractmethod
+    def forward(self, omega_i: Tensor) -> Tensor:
+        """Radiance `[..., C]` from directions `[..., 2]`."""
+
+    @abstractmethod
+    def proposal(self) -> Proposal:
+        """A proposal that samples the light by the mean of its channels."""
+
+    @property
+    @abstractmethod
+    def label(self) -> str:
+        """A short name for tables and plots."""
+
+    def breakpoints(self) -> tuple[list[float], list[float]]:
+        """Inclinations theta_i in (-pi/2, pi/2) and absolute azimuths phi_i in (-pi, pi] where panels should break.
+
+        Sorted; they bracket peaks and mark kinks. Empty lists: the light is smooth.
+
+        Raises:
+            InputError: the light has a batch of rotations, and so no single list.
+        """
+        return [], []
+
+    def rotated(self, rotation: Any) -> Light:
+        """The same light in another frame, sharing all tables: one light serves every fibre of a scene."""
+        other = copy.copy(self)
+        other._buffers = dict(self._buffers)
+        other._buffers["rotation"] = check_rotation(rotation)
+        return other
+
+    def world_vector(self, omega_i: Tensor) -> Tensor:
+        """Unit vectors `[..., 3]` in the frame of the light's description."""
+        vector = to_vector(omega_i)
+        if self.rotation is None:
+            return vector
+        return (vector.unsqueeze(-2) @ self.rotation.to(vector)).squeeze(-2)
+
+    def to_fibre(self, vector: Tensor) -> Tensor:
+        """Vectors `[..., 3]` from the light's frame into the fibre frame."""
+        if self.rotation is None:
+            return vector
+        return (vector.unsqueeze(-2) @ self.rotation.to(vector).mT).squeeze(-2)
+
+    def single_frame(self) -> None:
+        """Raise `InputError` if there is a batch of rotations."""
+        if self.rotation is not None and self.rotation.dim() > 2:
+            raise InputError(
+                "rotation", tuple(self.rotation.shape), "one 3 x 3 matrix to ask a light for its breakpoints"
+            )
+
+    def extra_repr(self) -> str:
+        return f"{self.label}, channels={self.channels}"
+
+
+def tidy(thetas: list[float], phis: list[float]) -> tuple[list[float], list[float]]:
+    """Sorted, distinct (to 1e-12) breakpoints: theta inside (-pi/2, pi/2), phi wrapped."""
+
+    def distinct(values: list[float]) -> list[float]:
+        kept: list[float] = []
+        for value in sorted(values):
+            if not kept or value - kept[-1] > 1e-12:
+                kept.append(value)
+        return kept
+
+    wrapped = [wrap(torch.tensor(phi, dtype=torch.float64)).item() for phi in phis]
+    return distinct([theta for theta in thetas if abs(theta) < HALF_PI]), distinct(wrapped)
+
+
+def around(direction: Tensor, width: float, multiples: tuple[float, ...]) -> tuple[list[float], list[float]]:
+    """Breakpoints at a peak in the fibre-frame direction `[3]` and at multiples of its angular width on both sides."""
+    theta, phi = (x.item() for x in to_angles(direction.detach().to(torch.float64)).unbind(-1))
+    thetas, phis = [theta], [phi]
+    for step in (m * width for m in multiples):
+        if step < math.pi:
+            thetas += [theta - step, theta + step]
+        # A cap of angular radius r around inclination theta spans asin(sin r / cos theta) in azimuth, and all of it
+        # past the pole.
+        if step < HALF_PI and math.sin(step) < math.cos(theta):
+            spread = math.asin(math.sin(step) / math.cos(theta))
+            phis += [phi - spread, phi + spread]
+    return tidy(thetas, phis)
+
+
+class LightDistribution(Distribution):
+    """A distribution that belongs to a light and depends on the context only through its batch shape."""
+
+    def __init__(self, light: Light, context: Context) -> None:
+        self.light = light
+        self.batch_shape = context.batch_shape
+
+    def sample_with_log_prob(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        # The density of the returned direction, not of the one before rounding: what other strategies of a MIS estimate
+        # will see.
+        omega = self.sample(u)
+        return omega, self.log_prob(omega)
