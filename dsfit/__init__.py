@@ -1,0 +1,51 @@
+"""dsfit: Monte Carlo rendering of hair that converges faster.
+
+Differentiable dual scattering BSDF, proposal densities, multiple importance sampling, and fits of the proposals to a reference
+integrand. See the README for a tour; the names below are the public contract.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+_PUBLIC = {
+    "Averages": "dsfit.bsdf",
+    "Context": "dsfit.context",
+    "Convention": "dsfit.bsdf",
+    "DualScattering": "dsfit.bsdf",
+    "Estimate": "dsfit.mis",
+    "Fiber": "dsfit.bsdf",
+    "Fit": "dsfit.fit",
+    "InputError": "dsfit.errors",
+    "Integrand": "dsfit.scene",
+    "Material": "dsfit.material",
+    "Nodes": "dsfit.reference",
+    "StructuredProposal": "dsfit.proposals",
+    "estimate": "dsfit.mis",
+    "excess": "dsfit.reference",
+    "fit": "dsfit.fit",
+    "load_proposal": "dsfit.experiment",
+    "quadrature_nodes": "dsfit.reference",
+    "reference": "dsfit.reference",
+    "save_proposal": "dsfit.experiment",
+}
+
+__all__ = sorted(_PUBLIC)
+
+
+def __getattr__(name: str) -> Any:
+    """Public names are loaded when first used, so that `import dsfit` costs little more than `import torch`."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'dsfit' has no attribute {name!r}")
+    module = importlib.import_module(_PUBLIC[name])
+    value = getattr(module, name)
+    if not (name in ("fit",) and isinstance(value, type(module))):
+        globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_PUBLIC])

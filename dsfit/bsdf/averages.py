@@ -1,0 +1,199 @@
+"""Average attenuation and lobe statistics of one scattering event, over both hemispheres, as functions of theta_in."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dsfit.bsdf.attenuation import forward_backward_energies, lobe_energies
+from dsfit.bsdf.backscatter import back_shift, back_width, backscatter_albedo
+from dsfit.bsdf.conventions import Convention
+from dsfit.bsdf.fiber import Fiber
+from dsfit.bsdf.scattered import offset_windows
+from dsfit.bsdf.snell import Refraction
+from dsfit.frame import HALF_PI
+from dsfit.quadrature import PiecewiseChebyshev, graded_ends, merge_breaks, panel_points
+
+_ECCENTRIC_NODES = 24
+
+
+@dataclass(frozen=True)
+class Averages:
+    """Averages at an inclination theta_in, each `[..., C]` (Zinke et al. 2008, eqs 6, 12-17).
+
+    Attributes:
+        a_f, a_b: average forward and backward attenuation.
+        alpha_f, alpha_b: average longitudinal shift of forward and backward scattering, radians.
+        beta_f, beta_b: average longitudinal standard deviation, radians.
+        A_b: backward attenuation of the surrounding hair, A_1 + A_3.
+        delta_b: average longitudinal shift of back scattering.
+        sigma_b: standard deviation of back scattering.
+    """
+
+    a_f: Tensor
+    a_b: Tensor
+    alpha_f: Tensor
+    alpha_b: Tensor
+    beta_f: Tensor
+    beta_b: Tensor
+    A_b: Tensor
+    delta_b: Tensor
+    sigma_b: Tensor
+
+
+class LobeShares:
+    """Forward and backward share of each lobe, a_f^p and a_b^p, at theta_in.
+
+    With K = c_M g(theta_h - alpha_p; beta_p) cos(theta_in) cos(theta_o) / cos^2(theta_diff),
+    `a_f^p(theta_in) = int K [int N_p |phi|/pi dphi] dtheta_o` and a_b^p with 1 - |phi|/pi (Zinke et al. 2008, eqs 6 and 12, reduced). In
+    theta_h, `cos(theta_in) cos(theta_o)/cos^2(theta_diff) = 1 - sin^2(theta_h)/cos^2(theta_diff)`, which is bounded by 1.
+
+    Two nested interpolants make this fast to the last digits: the azimuthal energies as functions of theta_diff, and the shares,
+    divided by cos(theta_in), as functions of theta_in. Both refine themselves; neither uses Monte Carlo or roots.
+    """
+
+    def __init__(self, fiber: Fiber, convention: Convention) -> None:
+        if fiber.batch_shape:
+            raise ValueError("LobeShares takes one fibre at a time")
+        self.fiber, self.convention = fiber, convention
+        self._kinks = self._jumps()
+        inner = torch.tensor([0.4, 0.8, 1.2], dtype=self._kinks.dtype)
+        breaks = merge_breaks(torch.cat([self._kinks, inner]), 0.0, HALF_PI, 1e-12)
+        energies = PiecewiseChebyshev(self._energies_at, breaks, tolerance=1e-12)
+        self._energies = [energies.select(lambda c, p=p: self._of_lobe(c, p)) for p in range(3)]
+        self._shares = PiecewiseChebyshev(self._scaled_shares_at, self._share_breaks(), tolerance=1e-11)
+
+    def __call__(self, theta_in: Tensor) -> tuple[Tensor, Tensor]:
+        """a_f^p and a_b^p, each `[..., 3, C]`."""
+        scaled = self._shares(theta_in)
+        scaled = scaled.reshape(*theta_in.shape, 2, 3, self.fiber.channels)
+        value = scaled * torch.cos(theta_in).clamp_min(0.0)[..., None, None, None]
+        return value.select(-3, 0), value.select(-3, 1)
+
+    def _jumps(self) -> Tensor:
+        """theta_diff where eta' = 2 or eta' = sqrt 2 for some orientation: the TRT share has a jump in its second derivative there."""
+        fiber = self.fiber
+        etas = [fiber.eta] if fiber.is_round else [fiber.eta_trt(angle) for angle in self._orientations()]
+        points = []
+        for eta in etas:
+            for target in (2.0, math.sqrt(2.0)):
+                cos2 = (eta.detach() ** 2 - 1) / (target * target - 1)
+                if 0.0 < float(cos2) < 1.0:
+                    points.append(torch.acos(torch.sqrt(cos2)).reshape(()))
+        return torch.stack(points) if points else torch.zeros(0, dtype=fiber.dtype)
+
+    def _orientations(self) -> Tensor:
+        """phi_h over one period; the average over them is that of a periodic analytic function, for which the trapezium rule is exact."""
+        return torch.arange(_ECCENTRIC_NODES, dtype=self.fiber.dtype) * (math.pi / _ECCENTRIC_NODES)
+
+    def _energies_at(self, theta_diff: Tensor) -> Tensor:
+        fiber = self.fiber
+        plain = Refraction.at(fiber.eta, theta_diff)
+        if fiber.is_round:
+            return self._split((plain, plain, plain)).flatten(1)
+        total: Tensor | float = 0.0
+        for angle in self._orientations():
+            bent = Refraction.at(fiber.eta_trt(angle), theta_diff)
+            total = total + self._split((plain, plain, bent))
+        return (total / _ECCENTRIC_NODES).flatten(1)
+
+    def _of_lobe(self, columns: Tensor, p: int) -> Tensor:
+        return columns.unflatten(-1, (2, 3, self.fiber.channels))[..., p, :].flatten(-2)
+
+    def _split(self, bent: tuple[Refraction, ...]) -> Tensor:
+        """Forward and backward azimuthal energy, `[M, 2, 3, C]`."""
+        fiber, absorption = self.fiber, self.convention.absorption
+        if self.convention.split == "fraction":
+            front, back = forward_backward_energies(bent, fiber.sigma_a, absorption)
+        else:
+            total = lobe_energies(bent, fiber.sigma_a, absorption)
+            phi = torch.full_like(bent[0].kappa, math.pi)
+            front = offset_windows(fiber, bent, phi, "raw", absorption)
+            back = total - front
+        return torch.stack([front, back], dim=1)
+
+    def _share_breaks(self) -> Tensor:
+        """Break points in theta_in: where a lobe leaves the reachable set, where it meets the kink at eta' = 2, and the ends."""
+        fiber = self.fiber
+        alpha, beta = fiber.alpha.detach(), fiber.beta.detach()
+        offsets = torch.tensor([-9.0, -4.0, 0.0, 4.0, 9.0], dtype=alpha.dtype)
+        kinks = self._kinks
+        centers = [2 * alpha - HALF_PI, 2 * alpha + HALF_PI]
+        widths = [2 * beta, 2 * beta]
+        for kink in kinks:
+            centers += [alpha - kink, alpha + kink]
+            widths += [beta, beta]
+        points = torch.stack(centers)[..., None] + torch.stack(widths)[..., None] * offsets
+        ends = torch.tensor(graded_ends(-HALF_PI, HALF_PI, levels=20), dtype=alpha.dtype)
+        return merge_breaks(torch.cat([points.flatten(), ends]), -HALF_PI, HALF_PI, 1e-9)
+
+    def _scaled_shares_at(self, theta_in: Tensor) -> Tensor:
+        parts = [self._lobe_at(p, theta_in) for p in range(3)]
+        return torch.stack(parts, dim=2).flatten(1)
+
+    def _lobe_at(self, p: int, theta_in: Tensor) -> Tensor:
+        """a^p / cos(theta_in), `[M, 2, C]`, by composite Gauss-Legendre in theta_h on panels that follow the lobe and the kinks."""
+        fiber = self.fiber
+        alpha, beta = fiber.alpha[p], fiber.beta[p]
+        low, high = theta_in / 2 - math.pi / 4, theta_in / 2 + math.pi / 4
+        steps = torch.tensor([-8.5, -4.5, -1.5, 1.5, 4.5, 8.5], dtype=theta_in.dtype)
+        around = (alpha.detach() + beta.detach() * steps).expand(len(theta_in), -1)
+        kinks = self._kinks
+        crossing = torch.cat([theta_in[:, None] + kinks, theta_in[:, None] - kinks, theta_in[:, None]], dim=1)
+        # near grazing the factor 1/cos^2(theta_diff) is a boundary layer at the end of the interval: geometric panels there
+        grade = torch.tensor([0.25**k for k in range(1, 14)], dtype=theta_in.dtype) * HALF_PI
+        layers = torch.cat([low[:, None] + grade, high[:, None] - grade], dim=1)
+        breaks = torch.cat([low[:, None], high[:, None], around, crossing, layers], dim=1)
+        near = torch.maximum(low, torch.minimum(high, around[:, 0]))[:, None]
+        far = torch.minimum(high, torch.maximum(low, around[:, -1]))[:, None]
+        breaks = torch.sort(torch.minimum(torch.maximum(breaks, near), far), dim=1).values
+        theta_h, weight = panel_points(breaks.detach(), 10)
+        theta_o = 2 * theta_h - theta_in[:, None]
+        theta_diff = theta_h - theta_in[:, None]
+        used = weight > 0
+        energies = theta_h.new_zeros(*theta_h.shape, 2, fiber.channels)
+        flat = self._energies[p](theta_diff[used].abs()).reshape(-1, 2, fiber.channels)
+        energies = energies.index_put((used,), flat)
+        gauss = torch.exp(-0.5 * ((theta_h - alpha) / beta) ** 2) / (beta * math.sqrt(2 * math.pi))
+        outgoing = torch.cos(theta_o).clamp_min(0.0) / torch.cos(theta_diff).clamp_min(1e-150) ** 2
+        if self.convention.average_weight == "outgoing":
+            outgoing = outgoing * torch.cos(theta_o) / torch.cos(theta_in).clamp_min(1e-150)[:, None]
+        kernel = torch.where(used, 2 * self.convention.lobe_constant * gauss * weight * outgoing, 0.0)
+        return torch.einsum("mq,mqsc->msc", kernel, energies)
+
+
+def averages_from_shares(fiber: Fiber, convention: Convention, front: Tensor, back: Tensor, d_b: Tensor) -> Averages:
+    """All averages from the lobes' forward and backward shares `[..., 3, C]`.
+
+    a_f = sum_p a_f^p; alpha_f = sum_p a_f^p alpha_p / a_f; beta_f^2 = sum_p a_f^p beta_p^2 / a_f (or beta_f by beta_p); likewise backward. R never
+    vanishes, so the denominators are positive.
+    """
+    a_f, a_b = front.sum(-2), back.sum(-2)
+    tiny = torch.finfo(a_f.dtype).tiny
+    alpha, beta = fiber.alpha.unsqueeze(-1), fiber.beta.unsqueeze(-1)
+
+    def mean(share: Tensor, total: Tensor, value: Tensor) -> Tensor:
+        return (share * value).sum(-2) / total.clamp_min(tiny)
+
+    if convention.mean_width == "variance":
+        beta_f, beta_b = (torch.sqrt(mean(s, t, beta**2).clamp_min(tiny)) for s, t in ((front, a_f), (back, a_b)))
+    else:
+        beta_f, beta_b = mean(front, a_f, beta), mean(back, a_b, beta)
+    alpha_f, alpha_b = mean(front, a_f, alpha), mean(back, a_b, alpha)
+    if convention.limit_energy:
+        total = (a_f + a_b).clamp_min(1.0)
+        a_f, a_b = a_f / total, a_b / total
+    return Averages(
+        a_f=a_f,
+        a_b=a_b,
+        alpha_f=alpha_f,
+        alpha_b=alpha_b,
+        beta_f=beta_f,
+        beta_b=beta_b,
+        A_b=backscatter_albedo(a_f, a_b),
+        delta_b=back_shift(a_f, a_b, alpha_f, alpha_b, convention.shift_sign),
+        sigma_b=back_width(a_f, a_b, beta_f, beta_b, d_b),
+    )

@@ -1,0 +1,152 @@
+"""Azimuthal scattering N_R, N_TT, N_TRT and its average over incident half circles, N^G."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from dsfit.bsdf.attenuation import Absorption, attenuation, lobe_energies
+from dsfit.bsdf.fiber import Fiber
+from dsfit.bsdf.glint import Glint
+from dsfit.bsdf.scattered import offset_windows, simplified_windows
+from dsfit.bsdf.snell import Caustic, Refraction, exit_trt_slope, gamma_tt, root_falling, root_rising
+from dsfit.frame import HALF_PI, wrap
+from dsfit.special import wrapped_normal_log_prob
+
+AzimuthalModel = Literal["marschner", "raw", "simplified"]
+_CHUNK = 512
+AZIMUTHAL_MODELS: tuple[str, ...] = ("marschner", "raw", "simplified")
+
+
+def refractions(fiber: Fiber, theta_diff: Tensor, phi_h: Tensor | None) -> tuple[Refraction, Refraction, Refraction]:
+    """Refraction that R, TT and TRT see; eccentricity changes that of TRT alone."""
+    plain = Refraction.at(fiber.eta, theta_diff)
+    return plain, plain, plain if fiber.is_round else Refraction.at(fiber.eta_trt(phi_h), theta_diff)
+
+
+def azimuthal(
+    fiber: Fiber, theta_diff: Tensor, phi: Tensor, phi_h: Tensor | None, model: AzimuthalModel, absorption: Absorption
+) -> Tensor:
+    """N_p(theta_diff, phi) = (1/2) sum over roots of A(p, h) |dphi/dh|^-1, `[..., 3, C]`, per radian.
+
+    Even in phi. `marschner` treats the TRT caustic, `raw` leaves it (unbounded at the caustic), `simplified` is N_R, N_TRT ~ cos(phi/2),
+    N_TT ~ g(phi - pi; gamma_TT) (chapter eqs 21, 25) times each lobe's energy E_p; see `simplified_shapes`.
+    """
+    theta_diff, phi = torch.broadcast_tensors(theta_diff, wrap(phi).abs())
+    bent = refractions(fiber, theta_diff, phi_h)
+    if model == "simplified":
+        energies = lobe_energies(bent, fiber.sigma_a, absorption)
+        return simplified_shapes(fiber, phi).unsqueeze(-1) * energies
+    n_r = _n_r(fiber, bent[0], phi, absorption)
+    n_tt = _n_tt(fiber, bent[1], phi, absorption)
+    n_trt = _n_trt(fiber, bent[2], phi, model, absorption)
+    return torch.stack(torch.broadcast_tensors(n_r, n_tt, n_trt), dim=-2)
+
+
+def simplified_shapes(fiber: Fiber, phi: Tensor) -> Tensor:
+    """Unit-integral azimuths cos(phi/2)/4, wrapped g(phi - pi; gamma_TT), cos(phi/2)/4, `[..., 3]`."""
+    cosine = torch.cos(phi / 2) / 4
+    transmitted = torch.exp(wrapped_normal_log_prob(wrap(phi - math.pi), fiber.gamma_tt))
+    return torch.stack(torch.broadcast_tensors(cosine, transmitted, cosine), dim=-1)
+
+
+def printed_shapes(fiber: Fiber, phi: Tensor) -> Tensor:
+    """The simplified azimuths exactly as printed: cos(phi/2), g(phi - pi; gamma_TT), cos(phi/2) (eqs 25, 21)."""
+    factor = torch.tensor([4.0, 1.0, 4.0], dtype=phi.dtype, device=phi.device)
+    return simplified_shapes(fiber, phi) * factor
+
+
+def _n_r(fiber: Fiber, bent: Refraction, phi: Tensor, absorption: Absorption) -> Tensor:
+    """R: gamma = -phi/2, |dphi/dh| = 2/cos(gamma)."""
+    sin_gamma, cos_gamma = torch.sin(phi / 2), torch.cos(phi / 2).clamp_min(0.0)
+    return attenuation(0, bent, fiber.sigma_a, sin_gamma, cos_gamma, absorption) * (cos_gamma / 4).unsqueeze(-1)
+
+
+def _n_tt(fiber: Fiber, bent: Refraction, phi: Tensor, absorption: Absorption) -> Tensor:
+    """TT: one ray for |phi| >= 2 asin(kappa), none otherwise; |dphi/dh|^-1 = cos g cos g_t (kappa cos g + cos g_t)/(2 (1 - kappa^2))."""
+    kappa = bent.kappa
+    lit = phi > 2 * torch.asin(kappa)
+    inside = torch.where(lit, phi, math.pi)
+    sin_gamma, cos_gamma = gamma_tt(kappa, inside)
+    x = kappa * sin_gamma
+    cos_t = torch.sqrt((1 - x) * (1 + x))
+    density = cos_gamma * cos_t * (kappa * cos_gamma + cos_t) / (2 * (1 - kappa) * (1 + kappa))
+    value = attenuation(1, bent, fiber.sigma_a, sin_gamma, cos_gamma, absorption) * (density / 2).unsqueeze(-1)
+    return torch.where(lit.unsqueeze(-1), value, 0.0)
+
+
+def _n_trt(fiber: Fiber, bent: Refraction, phi: Tensor, model: AzimuthalModel, absorption: Absorption) -> Tensor:
+    """TRT: up to three rays; two meet at the caustic phi_c, where the raw density is infinite."""
+    kappa = bent.kappa
+    kappa, phi = torch.broadcast_tensors(kappa, phi)
+    caustic = Caustic.at(kappa)
+    below = phi < caustic.phi
+    branches = [
+        (caustic.folded & below, root_rising, phi),
+        ((phi > caustic.edge) & below, root_falling, phi),
+        (-phi > caustic.edge, root_falling, -phi),
+    ]
+    total: Tensor | float = 0.0
+    for lit, root, azimuth in branches:
+        if not bool(lit.any()):
+            continue
+        gamma = root(kappa, caustic, torch.where(lit, azimuth, (caustic.phi + caustic.edge).detach() / 2))
+        slope = exit_trt_slope(kappa, gamma).abs().clamp_min(4 * torch.finfo(phi.dtype).eps ** 0.5)
+        sin_gamma, cos_gamma = torch.sin(gamma), torch.cos(gamma).clamp_min(0.0)
+        value = attenuation(2, bent, fiber.sigma_a, sin_gamma, cos_gamma, absorption)
+        total = total + torch.where(lit.unsqueeze(-1), value * (cos_gamma / slope / 2).unsqueeze(-1), 0.0)
+    if isinstance(total, float):
+        total = torch.zeros(*phi.shape, fiber.channels, dtype=phi.dtype, device=phi.device)
+    if model == "raw":
+        return total
+    glint = Glint.of(fiber, bent, caustic, absorption)
+    return total * glint.removal(phi).unsqueeze(-1) + glint.added(phi)
+
+
+def azimuthal_scattered(
+    fiber: Fiber, theta_diff: Tensor, phi: Tensor, phi_h: Tensor | None, model: AzimuthalModel, absorption: Absorption
+) -> Tensor:
+    """N^G_p(phi) = (1/pi) int_{-pi/2}^{pi/2} N_p(theta_diff, wrap(phi - phi')) dphi', `[..., 3, C]`, per radian (eq 11 as a convolution).
+
+    A difference of the cumulative azimuth, which is an integral over offsets and so smooth even where N_p is infinite; int N^G = int N.
+    For an eccentric fibre the index of TRT is that of the unscattered pair of directions (phi_h is held during the average).
+    """
+    theta_diff, phi = torch.broadcast_tensors(theta_diff, wrap(phi).abs())
+    if not fiber.batch_shape and phi.numel() > _CHUNK:
+        return _in_chunks(fiber, theta_diff, phi, phi_h, model, absorption)
+    bent = refractions(fiber, theta_diff, phi_h)
+    if model == "simplified":
+        energies = lobe_energies(bent, fiber.sigma_a, absorption)
+        return simplified_windows(fiber, phi).unsqueeze(-1) * energies / math.pi
+    return offset_windows(fiber, bent, phi, model, absorption) / math.pi
+
+
+def _in_chunks(
+    fiber: Fiber, theta_diff: Tensor, phi: Tensor, phi_h: Tensor | None, model: AzimuthalModel, absorption: Absorption
+) -> Tensor:
+    """Hundreds of attenuations per direction: a few hundred directions at a time stay in cache (several times faster)."""
+    shape = torch.broadcast_shapes(phi.shape, () if phi_h is None else phi_h.shape)
+    given = [theta_diff, phi] if phi_h is None else [theta_diff, phi, phi_h]
+    rows = [x.expand(shape).reshape(-1).split(_CHUNK) for x in given]
+    parts = []
+    for row in zip(*rows, strict=True):
+        parts.append(azimuthal_scattered(fiber, row[0], row[1], row[2] if len(row) > 2 else None, model, absorption))
+    return torch.cat(parts).reshape(*shape, *parts[0].shape[-2:])
+
+
+def azimuthal_constant(
+    fiber: Fiber, theta_diff: Tensor, phi_h: Tensor | None, model: AzimuthalModel, absorption: Absorption
+) -> Tensor:
+    """N^G as eq (11) prints it: (1/pi) int_{-pi/2}^{pi/2} N_p(theta_diff, phi') dphi', the same for every phi."""
+    return azimuthal_scattered(fiber, theta_diff, torch.zeros_like(theta_diff), phi_h, model, absorption)
+
+
+def support_edges(fiber: Fiber, theta_diff: Tensor, phi_h: Tensor | None = None) -> Tensor:
+    """|phi| in [0, pi] where some N_p starts, ends, or peaks: TT's edge, the TRT edge, the caustic; `[..., 3]`, sorted."""
+    bent = refractions(fiber, theta_diff, phi_h)
+    caustic = Caustic.at(bent[2].kappa)
+    edges = torch.broadcast_tensors(2 * torch.asin(bent[1].kappa), caustic.edge.abs(), caustic.phi)
+    return torch.sort(torch.stack(edges, dim=-1), dim=-1).values.clamp(0.0, 2 * HALF_PI)

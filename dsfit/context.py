@@ -1,0 +1,90 @@
+"""What is known when a direction is drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dsfit.errors import check_range
+from dsfit.frame import HALF_PI
+
+
+@dataclass(frozen=True, init=False)
+class Context:
+    """Shading context: viewing direction and scattering hints, a batch of them at once.
+
+    Args:
+        theta_r: inclination of the viewing direction, radians, |theta_r| <= pi/2.
+        phi_r: azimuth of the viewing direction, radians.
+        n: hint for the number of scattering fibres towards the light, real and >= 0.
+        v: hint for the directly lit share in [0, 1]; left out, it is 1 where n = 0 and 0 elsewhere.
+        dtype: dtype of all fields; left out, that of the first tensor given, else float64.
+
+    All fields are broadcast to one batch shape. Context dimensions are the last ones of any sample: `omega` drawn for a context of
+    shape `[*batch]` has shape `[*samples, *batch, 2]`.
+
+    Raises:
+        InputError: a field is not finite or out of range.
+    """
+
+    theta_r: Tensor
+    phi_r: Tensor
+    n: Tensor
+    v: Tensor
+
+    def __init__(
+        self, theta_r: Any, phi_r: Any = 0.0, n: Any = 0.0, v: Any = None, *, dtype: torch.dtype | None = None
+    ) -> None:
+        given = [x for x in (theta_r, phi_r, n, v) if isinstance(x, Tensor) and x.is_floating_point()]
+        dtype = dtype or (given[0].dtype if given else torch.float64)
+        device = given[0].device if given else None
+        fields = [torch.as_tensor(x, dtype=dtype, device=device) for x in (theta_r, phi_r, n)]
+        limit = torch.tensor(HALF_PI, dtype=dtype).item()
+        check_range("context.theta_r", fields[0], -limit, limit)
+        check_range("context.phi_r", fields[1])
+        check_range("context.n", fields[2], 0.0)
+        if v is None:
+            share = (fields[2] == 0).to(dtype)
+        else:
+            share = check_range("context.v", torch.as_tensor(v, dtype=dtype, device=device), 0.0, 1.0)
+        for name, value in zip(("theta_r", "phi_r", "n", "v"), torch.broadcast_tensors(*fields, share), strict=True):
+            object.__setattr__(self, name, value)
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Shape of every field."""
+        return self.theta_r.shape
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """dtype of every field."""
+        return self.theta_r.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Device of every field."""
+        return self.theta_r.device
+
+    def _map(self, function: Any) -> Context:
+        return Context(function(self.theta_r), function(self.phi_r), function(self.n), function(self.v))
+
+    def to(self, *args: Any, **kwargs: Any) -> Context:
+        """The same context in another dtype or on another device (arguments of `Tensor.to`)."""
+        return self._map(lambda x: x.to(*args, **kwargs))
+
+    def reshape(self, *shape: int) -> Context:
+        """The same contexts in another batch shape."""
+        return self._map(lambda x: x.reshape(*shape))
+
+    def expand(self, *shape: int) -> Context:
+        """The contexts broadcast to a larger batch shape."""
+        return self._map(lambda x: x.expand(*shape))
+
+    def __getitem__(self, index: Any) -> Context:
+        return self._map(lambda x: x[index])
+
+    def __len__(self) -> int:
+        return len(self.theta_r)
