@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dsfit.scene.exr import ExrImage, read_exr, write_exr
+from dsfit.scene.integrand import Integrand
 from dsfit.scene.lights import ConstantLight, EnvironmentLight, Light, VonMisesFisherLights
 from dsfit.scene.scattering import ConstantScattering, Scattering, SlabScattering, SphereScattering
 
@@ -11,6 +12,7 @@ __all__ = [
     "ConstantScattering",
     "EnvironmentLight",
     "ExrImage",
+    "Integrand",
     "Light",
     "Scattering",
     "SlabScattering",

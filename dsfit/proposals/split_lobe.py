@@ -1,0 +1,87 @@
+"""A longitudinal lobe with different widths on either side of its mode."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dsfit.context import Context
+from dsfit.frame import reachable
+from dsfit.proposals.base import BatchFields, Longitudinal, LongitudinalDistribution
+from dsfit.proposals.parameters import MEAN_BOUNDS, STD_BOUNDS, Bounded
+from dsfit.special import log_normal_mass, truncated_normal_icdf
+
+_LOG_ROOT_2PI = 0.5 * math.log(2 * math.pi)
+
+
+@dataclass(frozen=True)
+class SplitGaussianInclination(BatchFields, LongitudinalDistribution):
+    """theta_h from a two-piece normal law on the reachable interval; per radian of theta_i."""
+
+    theta_r: Tensor
+    mode: Tensor
+    below: Tensor
+    above: Tensor
+
+    def _masses(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """L, H, the mode clamped to them, and the log masses of both pieces in units of the density's peak."""
+        low, high = reachable(self.theta_r)
+        low, high, mode = torch.broadcast_tensors(low, high, self.mode)
+        split = torch.minimum(torch.maximum(mode, low), high)
+        masses = []
+        for start, end, std in ((low, split, self.below), (split, high, self.above)):
+            a, b = (start - mode) / std, (end - mode) / std
+            empty = end <= start
+            mass = log_normal_mass(torch.where(empty, 0.0, a), torch.where(empty, 1.0, b)) + torch.log(std)
+            masses.append((mass + _LOG_ROOT_2PI).masked_fill(empty, -math.inf))
+        return low, high, split, masses[0], masses[1]
+
+    def log_prob(self, theta_i: Tensor) -> Tensor:
+        theta_h = (theta_i + self.theta_r) / 2
+        _, _, _, left, right = self._masses()
+        x = theta_h - self.mode
+        std = torch.where(x < 0, self.below, self.above)
+        return -0.5 * (x / std) ** 2 - torch.logaddexp(left, right) - math.log(2)
+
+    def sample(self, u: Tensor) -> Tensor:
+        low, high, split, left, right = self._masses()
+        share = torch.exp(left - torch.logaddexp(left, right))
+        on_left = u < share
+        tiny = torch.finfo(u.dtype).tiny
+        inner = torch.where(on_left, u / share.clamp_min(tiny), (u - share) / (1 - share).clamp_min(tiny))
+        std = torch.where(on_left, self.below, self.above)
+        start, end = torch.where(on_left, low, split), torch.where(on_left, split, high)
+        theta_h = truncated_normal_icdf(inner.clamp(0, 1), self.mode.expand_as(std), std, start, end)
+        return (2 * theta_h - self.theta_r).clamp(-math.pi / 2, math.pi / 2)
+
+
+class SplitGaussianLobe(Longitudinal):
+    """`theta_h` from a two-piece normal law: density ~ exp(-(theta_h - mode)^2 / 2 s^2), s = `below` or `above` the
+    mode, on [L, H].
+
+    What multiplies a lobe of the integrand (1/cos^2 theta_diff, Fresnel, a_f^n) tilts it, so that its two flanks
+    differ. Truncated, normalised exactly, sampled by inverse CDF; p_theta = p_h / 2.
+
+    Args:
+        mode, below, above: radians of theta_h. Bijections: `parameters.Bounded`.
+
+    Raises:
+        InputError: a value outside its bounds.
+    """
+
+    def __init__(
+        self, mode: float | Tensor, below: float | Tensor, above: float | Tensor, *, learnable: bool = True
+    ) -> None:
+        super().__init__()
+        self.mode = Bounded("mode", mode, *MEAN_BOUNDS, learnable=learnable)
+        self.below = Bounded("below", below, *STD_BOUNDS, log=True, learnable=learnable)
+        self.above = Bounded("above", above, *STD_BOUNDS, log=True, learnable=learnable)
+
+    def forward(self, context: Context) -> SplitGaussianInclination:
+        return SplitGaussianInclination(context.theta_r, self.mode(context), self.below(context), self.above(context))
+
+
+__all__ = ["SplitGaussianInclination", "SplitGaussianLobe"]
