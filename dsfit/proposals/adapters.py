@@ -74,12 +74,12 @@ class DensityDistribution(Distribution):
         return omega, self.log_prob(omega)
 
     def sample(self, u: Tensor) -> Tensor:
-        return to_omega(self.space, self._sample(u), self.context.phi_r)
+        return to_omega(self.space, self._sample(u).to(self.context.dtype), self.context.phi_r)
 
     def log_prob(self, omega: Tensor) -> Tensor:
         point, log_scale = from_omega(self.space, omega, self.context.phi_r)
         inside = omega[..., 0].abs() <= HALF_PI * (1 + 4 * torch.finfo(omega.dtype).eps)
-        return torch.where(inside, self._log_prob(point) + log_scale, -math.inf)
+        return torch.where(inside, self._log_prob(point).to(self.context.dtype) + log_scale, -math.inf)
 
 
 class FromDensity(Proposal):

@@ -15,8 +15,9 @@ from dsfit.frame import HALF_PI, TWO_PI, wrap
 from dsfit.proposals.base import Azimuthal, AzimuthalDistribution, BatchFields
 from dsfit.proposals.parameters import AZIMUTH_STD_BOUNDS, Bounded
 from dsfit.special import (
-    any_of,
+    Branch,
     log_normal_mass,
+    piecewise,
     truncated_normal_icdf,
     truncated_normal_log_prob,
     wrapped_normal_log_prob,
@@ -79,18 +80,40 @@ class WrappedGaussianLaw(BatchFields, AzimuthalDistribution):
         Above std = 0.9 by its Fourier series, `(1 / 2 pi) (1 + 2 sum_k e^{-k^2 std^2 / 2} cos(k d) sin(k pi/2) / (k
         pi/2))`.
         """
-        d, wide = wrap(phi - math.pi), self.std > 0.9
-        s = torch.where(wide, 0.9, self.std)
-        ends = [((d + turn - HALF_PI) / s, (d + turn + HALF_PI) / s) for turn in (-TWO_PI, 0.0, TWO_PI)]
-        result = torch.logsumexp(torch.stack([log_normal_mass(a, b) for a, b in ends]), dim=0) - _LOG_PI
-        if not any_of(wide):
-            return result
-        s = self.std.clamp_min(0.9)
-        waves = 0.0
-        for k in (1, 3, 5, 7, 9, 11):  # sin(k pi / 2) vanishes for even k
-            sinc = (2 / (math.pi * k)) * (1 if k % 4 == 1 else -1)
-            waves = waves + sinc * torch.exp(-0.5 * (k * s) ** 2) * torch.cos(k * d)
-        return torch.where(wide, torch.log1p(2 * waves) - math.log(TWO_PI), result)
+        d = wrap(phi - math.pi).abs()
+        narrow, wide = self.std < _NARROW[phi.dtype], self.std > 0.9
+        branches: list[Branch] = [
+            (~(narrow | wide), _scattered_by_erfc, (0.0, 0.5)),
+            (narrow, _scattered_by_masses, (0.0, 0.1)),
+            (wide, _scattered_by_waves, (0.0, 1.0)),
+        ]
+        return piecewise(branches, d, self.std)
+
+
+_NARROW = {torch.float64: 0.045, torch.float32: 0.14}  # below, erfc of the far side underflows
+
+
+def _scattered_by_erfc(d: Tensor, std: Tensor) -> Tensor:
+    s = math.sqrt(0.5) / std
+    far = torch.special.erfc((1.5 * math.pi - d) * s) + torch.special.erfc((1.5 * math.pi + d) * s)
+    far = far - torch.special.erfc((2.5 * math.pi - d) * s)
+    main = torch.special.erfc((d - HALF_PI) * s) - torch.special.erfc((d + HALF_PI) * s)
+    return torch.log(main + far) - math.log(TWO_PI)
+
+
+def _scattered_by_masses(d: Tensor, std: Tensor) -> Tensor:
+    """As above but in logs, for a single pair of images: the others are beyond 1e-100."""
+    image = TWO_PI - d
+    near, far = (log_normal_mass((x - HALF_PI) / std, (x + HALF_PI) / std) for x in (d, image))
+    return torch.logaddexp(near, far) - _LOG_PI
+
+
+def _scattered_by_waves(d: Tensor, std: Tensor) -> Tensor:
+    waves = 0.0
+    for k in (1, 3, 5, 7, 9, 11):  # sin(k pi / 2) vanishes for even k
+        sinc = (2 / (math.pi * k)) * (1 if k % 4 == 1 else -1)
+        waves = waves + sinc * torch.exp(-0.5 * (k * std) ** 2) * torch.cos(k * d)
+    return torch.log1p(2 * waves) - math.log(TWO_PI)
 
 
 class WrappedGaussian(Azimuthal):

@@ -14,6 +14,7 @@ from typing import Self
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call, grad, jacfwd, vmap
 
 from dsfit.context import Context
 from dsfit.frame import cos_inclination, wrap
@@ -89,6 +90,30 @@ class Proposal(Learnable, nn.Module, ABC):
     @abstractmethod
     def forward(self, context: Context) -> Distribution:
         """The distribution over omega_i for these contexts."""
+
+    def log_prob_with_jacobian(self, context: Context, omega: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """`log p(omega)` `[...]` and its derivative `[..., *parameter]` in every parameter by name; detached.
+
+        What Gauss-Newton over many directions asks for. For one context the derivative is taken in reverse mode
+        direction by direction, vectorised by vmap, which costs about as much as five evaluations whatever the number of
+        parameters; for a batch of contexts in forward mode. It is 0 where p is 0.
+        """
+        parameters = {name: value.detach() for name, value in self.named_parameters()}
+        if not parameters:
+            with torch.no_grad():
+                return self(context).log_prob(omega), {}
+
+        def log_prob(values: dict[str, Tensor], direction: Tensor) -> tuple[Tensor, Tensor]:
+            found = functional_call(self, values, (context,)).log_prob(direction)
+            return torch.where(found.isinf(), 0.0, found), found
+
+        if len(context.batch_shape):
+            jacobian, value = jacfwd(log_prob, has_aux=True)(parameters, omega)
+            return value, jacobian
+        flat = omega.reshape(-1, omega.shape[-1])
+        jacobian, value = vmap(grad(log_prob, has_aux=True), in_dims=(None, 0))(parameters, flat)
+        shape = omega.shape[:-1]
+        return value.reshape(shape), {name: x.reshape(*shape, *x.shape[1:]) for name, x in jacobian.items()}
 
 
 class LongitudinalDistribution(Selectable, ABC):

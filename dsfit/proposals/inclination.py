@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dsfit.frame import HALF_PI, reachable
 from dsfit.proposals.base import BatchFields, LongitudinalDistribution
-from dsfit.special import truncated_normal_icdf, truncated_normal_log_prob
+from dsfit.special import any_of, is_tracked, truncated_normal_icdf, truncated_normal_log_density
 
 VARIABLES = ("half", "diff", "in")
 _LOG_JACOBIAN = {"half": -math.log(2), "diff": -math.log(2), "in": 0.0}  # log |dt / dtheta_i|
@@ -34,13 +34,15 @@ def from_theta_i(variable: str, theta_i: Tensor, theta_r: Tensor) -> Tensor:
 def to_theta_i(variable: str, t: Tensor, theta_r: Tensor) -> Tensor:
     """The variable to theta_i, kept in [-pi/2, pi/2] against rounding without cutting the gradient."""
     theta_i = t if variable == "in" else (2 * t - theta_r if variable == "half" else theta_r - 2 * t)
-    return theta_i + (theta_i.clamp(-HALF_PI, HALF_PI) - theta_i).detach()
+    inside = theta_i.clamp(-HALF_PI, HALF_PI)
+    return theta_i + (inside - theta_i).detach() if is_tracked(theta_i) else inside
 
 
 def on_support(theta_i: Tensor, log_density: Callable[[Tensor], Tensor]) -> Tensor:
     """`log_density(theta_i)` for |theta_i| <= pi/2 (to a few ulp), -inf with zero gradient beyond."""
-    inside = theta_i.abs() <= HALF_PI * (1 + 4 * torch.finfo(theta_i.dtype).eps)
-    return torch.where(inside, log_density(theta_i.clamp(-HALF_PI, HALF_PI)), -math.inf)
+    value = log_density(theta_i.clamp(-HALF_PI, HALF_PI))
+    outside = theta_i.abs() > HALF_PI * (1 + 4 * torch.finfo(theta_i.dtype).eps)
+    return value.masked_fill(outside, -math.inf) if any_of(outside) else value
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,6 @@ class TruncatedGaussianInclination(BatchFields, LongitudinalDistribution):
         def inside(theta: Tensor) -> Tensor:
             t = from_theta_i(self.variable, theta, self.theta_r)
             t = torch.minimum(torch.maximum(t, low), high)  # rounding only
-            return truncated_normal_log_prob(t, self.mean, self.std, low, high) + _LOG_JACOBIAN[self.variable]
+            return truncated_normal_log_density(t, self.mean, self.std, low, high) + _LOG_JACOBIAN[self.variable]
 
         return on_support(theta_i, inside)
