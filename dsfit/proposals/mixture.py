@@ -166,3 +166,32 @@ class Mixture(Proposal):
             log_weights = torch.cat([log_weights, share], dim=-1)
             parts.append(self.sphere(context))
         return MixtureDistribution(parts, log_weights.to(context.dtype))
+
+    def log_prob_with_jacobian(self, context: Context, omega: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """As for any proposal, but each component is differentiated by itself, in its own parameters alone.
+
+        `d log p / d x_k = r_k d log p_k / d x_k` with the share `r_k = w_k p_k / p` that the component has in the
+        density; components that know a faster way use it.
+        """
+        if self.logits.dim() > 1:
+            return super().log_prob_with_jacobian(context, omega)
+        parts = [component.log_prob_with_jacobian(context, omega) for component in self.components]
+        with torch.no_grad():
+            log_weights = torch.log_softmax(self.logits, dim=-1).to(context.dtype) + math.log1p(-self.defensive)
+            logs = [value + weight for (value, _), weight in zip(parts, log_weights.unbind(), strict=True)]
+            if self.defensive > 0:
+                logs.append(self.sphere(context).log_prob(omega) + math.log(self.defensive))
+            value = log_sum_exp(torch.stack(torch.broadcast_tensors(*logs), dim=-1))
+            base = value.masked_fill(value.isinf(), 0.0)
+            shares = torch.stack([torch.exp(x - base) for x in logs[: len(parts)]], dim=-1)
+            jacobian: dict[str, Tensor] = {}
+            if self.learnable:
+                softmax = torch.softmax(self.logits, dim=-1).to(context.dtype)
+                jacobian["logits"] = shares - shares.sum(dim=-1, keepdim=True) * softmax
+            for k, (_, slopes) in enumerate(parts):
+                for name, slope in slopes.items():
+                    own = shares[..., k]
+                    jacobian[f"components.{k}.{name}"] = (
+                        own.reshape(own.shape + (1,) * (slope.dim() - own.dim())) * slope
+                    )
+        return value, jacobian
