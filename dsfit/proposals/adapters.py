@@ -88,7 +88,7 @@ class FromDensity(Proposal):
     | space | a point is | its density is per |
     |---|---|---|
     | `angles` | (theta_i, phi), phi the relative azimuth in [-pi, pi] | radian squared |
-    | `vector` | unit vector (tangent, normal, binormal) in the frame turned to phi_r = 0 | steradian |
+    | `vector` | unit vector (tangent, normal, binormal) whose azimuth is phi | steradian |
     | `square` | (s, t) in the unit square: sin theta_i = 2 s - 1, phi = 2 pi (t - 1/2) | unit of area |
     | `plane` | the logits of such an (s, t): all of R^2, for flows | unit of area |
 

@@ -28,7 +28,8 @@ class FrozenAverages:
 
     A sampler does not know theta_i yet, so what depends on it is evaluated at the mirror direction and kept the same
     in `sample` and in `log_prob`; the density stays exact, only its shape is a guess (FORMULAS E7). The averages of
-    the last contexts are kept, because a fit asks for the same ones over and over.
+    the last contexts are kept, because a fit asks for the same ones over and over; make a new object after changing
+    the fibre in place.
 
     Args:
         source: anything with `averages(theta_in)` that returns fields `[..., C]` by name, such as `DualScattering`.
@@ -72,7 +73,7 @@ class AverageOf:
 
 
 def chapter_proposals(
-    bsdf_or_fiber: Any, averages: Any = None, *, back_azimuth: str = "all", learnable: bool = True
+    bsdf_or_fiber: Any, averages: Any = None, *, back_azimuth: str | None = None, learnable: bool = True
 ) -> dict[str, Proposal]:
     """The proposals that the chapter names, each a fresh module.
 
@@ -92,12 +93,14 @@ def chapter_proposals(
         bsdf_or_fiber: a `Fiber` (fields alpha, beta `[3]` and gamma_tt) or a `DualScattering`, whose `fiber` is used.
         averages: what has `averages(theta_in)`; left out, `bsdf_or_fiber` if it has them. Without any, `MG_*` and
             `back` are left out.
-        back_azimuth: "all" or "back", to match the f_back of the BSDF.
+        back_azimuth: "all" or "back"; left out, that of the BSDF's convention, else "all".
         learnable: whether the parameters are learned.
 
     Raises:
         InputError: another back_azimuth, or fibre values outside the bounds of the laws.
     """
+    if back_azimuth is None:
+        back_azimuth = getattr(getattr(bsdf_or_fiber, "convention", None), "back_azimuth", "all")
     check_choice("back_azimuth", back_azimuth, ("all", "back"))
     fiber = getattr(bsdf_or_fiber, "fiber", bsdf_or_fiber)
     alpha, beta = ([t[..., k] for k in range(3)] for t in (fiber.alpha, fiber.beta))

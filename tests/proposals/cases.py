@@ -31,6 +31,7 @@ class Case:
         phi_peaks: peaks in the relative azimuth phi.
         phi_breaks: kinks and jumps in phi, besides 0, +-pi/2 and +-pi.
         extremes: further builds, with parameters at the ends of their ranges, for the tests of finiteness.
+        one_to_one: False where several pairs of uniforms give the same direction.
         n: scattering count of the contexts.
         phi_r: azimuth of the viewer.
     """
@@ -41,6 +42,7 @@ class Case:
     phi_peaks: tuple[Peak, ...] = ()
     phi_breaks: tuple[float, ...] = ()
     extremes: tuple[Callable[[], Proposal], ...] = field(default=())
+    one_to_one: bool = True
     n: float = 3.0
     phi_r: float = 0.7
 
@@ -159,7 +161,13 @@ def _azimuthal() -> list[Case]:
             extremes = _sweep(lambda g, law=law: uniform_theta(law(g)), GAMMAS) if gamma == GAMMA else ()
             turned = _sweep(lambda g, law=law: uniform_theta(p.Scattered(law(g))), GAMMAS) if gamma == GAMMA else ()
             cases.append(
-                Case(label, lambda g=gamma, law=law: uniform_theta(law(g)), phi_peaks=edges, extremes=extremes)
+                Case(
+                    label,
+                    lambda g=gamma, law=law: uniform_theta(law(g)),
+                    phi_peaks=edges,
+                    extremes=extremes,
+                    one_to_one=law is truncated or gamma == GAMMA,
+                )
             )
             side = tuple((sign * math.pi / 2, gamma) for sign in (1, -1))
             cases.append(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -91,6 +92,23 @@ def test_scattered_cosine_values() -> None:
     phi = f64([0.0, 0.5, math.pi / 2, 2.0, 2.8, math.pi])
     expected = f64([2 * math.sqrt(2) / math.pi, 0.8723276622, 2 / math.pi, 0.5156494875, 0.3860230741, 0.37292322857])
     torch.testing.assert_close(4 * torch.exp(law.log_prob(phi, phi)), expected, rtol=1e-9, atol=0)
+
+
+def test_scattered_turns_by_a_quarter_at_most() -> None:
+    context = Context(0.0, dtype=torch.float64)
+    start = f64([[0.4, 0.0], [0.4, 0.5], [0.4, 1.0]])
+    phi = Scattered(CosineHalf())(context).sample(start, start[:, 0])
+    expected = CosineHalf()(context).sample(start[:1, :1], start[:1, 0]) + math.pi / 2 * f64([-1.0, 0.0, 1.0])
+    torch.testing.assert_close(phi, expected)
+
+
+def test_back_azimuth_follows_the_convention_of_the_bsdf() -> None:
+    bsdf = FakeBsdf()
+    bsdf.convention = SimpleNamespace(back_azimuth="back")
+    omega = f64([[0.1, 3.0]])
+    for choice, expected in ((None, -math.inf), ("back", -math.inf)):
+        assert chapter_proposals(bsdf, back_azimuth=choice)["back"](Context(0.2)).log_prob(omega).item() == expected
+    assert chapter_proposals(bsdf, back_azimuth="all")["back"](Context(0.2)).log_prob(omega).isfinite()
 
 
 @pytest.mark.parametrize("gamma", [0.02, 0.05, 0.3, 0.899, 0.901, 2.5])

@@ -168,6 +168,23 @@ def test_gradient_in_u(case: Case) -> None:
 
 
 @every_case
+def test_density_is_the_inverse_jacobian_of_the_sampler(case: Case) -> None:
+    """Where two uniforms give one direction, `p |d(sin theta, phi) / du| = 1` everywhere: sharper than chi-square."""
+    proposal, _, context, _, u = _functions(case)
+    distribution = proposal(context)
+    if distribution.dimension != 2 or not case.one_to_one:
+        pytest.skip("the map from uniforms to directions is not one to one")
+    u = u.clone().requires_grad_()
+    omega, log_prob = distribution.sample_with_log_prob(u)
+    rows = []
+    for value in (torch.sin(omega[..., 0]), omega[..., 1]):
+        (row,) = torch.autograd.grad(value.sum(), u, retain_graph=True)
+        rows.append(row)
+    determinant = rows[0][..., 0] * rows[1][..., 1] - rows[0][..., 1] * rows[1][..., 0]
+    torch.testing.assert_close(-torch.log(determinant.abs()), log_prob.detach(), rtol=1e-7, atol=1e-7)
+
+
+@every_case
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 def test_extremes_are_finite(case: Case, dtype: torch.dtype) -> None:
     """Widths from 1e-4 to 10, azimuths from 1e-3 to 50, viewing directions to 89.999 degrees: values and gradients."""
