@@ -161,7 +161,7 @@ def log_window(a: Tensor, b: Tensor, width: Tensor | None = None) -> Tensor:
 
 
 def log_normal_mass(a: Tensor, b: Tensor) -> Tensor:
-    """`log(Phi(b) - Phi(a))`, stable everywhere (FORMULAS section E); -inf where b <= a; infinite ends are allowed."""
+    """`log(Phi(b) - Phi(a))`, stable everywhere; -inf where b <= a; infinite ends are allowed."""
     c = nearest_to_zero(a, b)
     return log_window(a, b) - 0.5 * c * c - LOG_SQRT_2PI
 
@@ -178,7 +178,7 @@ def truncated_normal_log_prob(x: Tensor, mean: Tensor, std: Tensor, low: Tensor,
     """Log density at x of the normal law truncated to [low, high], per unit of x; -inf outside, with zero gradient.
 
     `-(x - r)(x + r - 2 mean) / (2 std^2) - log std - log K`, r = the point of [low, high] nearest to the mean: no term
-    is larger than the result needs it to be, however far the window is from the mean. FORMULAS section E.
+    is larger than the result needs it to be, however far the window is from the mean.
     """
     outside = (x < low) | (x > high)
     inner = torch.where(outside, torch.minimum(torch.maximum(mean, low), high).detach(), x)
@@ -194,7 +194,6 @@ def truncated_normal_icdf(u: Tensor, mean: Tensor, std: Tensor, low: Tensor, hig
         phi(z) dz = (1 - u) phi(a) da + u phi(b) db + (Phi(b) - Phi(a)) du,   x = mean + std z.
 
     First derivatives only: second derivatives of this function come out as zero. u is clamped into the open interval.
-    FORMULAS section E has the forms.
     """
     a, b, width = (low - mean) / std, (high - mean) / std, (high - low) / std
     with torch.no_grad():
@@ -207,10 +206,8 @@ def truncated_normal_icdf(u: Tensor, mean: Tensor, std: Tensor, low: Tensor, hig
         return x
     with torch.no_grad():
         c0 = nearest_to_zero(a0, b0)
-        from_a, from_b = (
-            torch.minimum((-a0).clamp_min(0), width0),
-            -torch.minimum(b0.clamp_min(0), width0),
-        )  # c - a, c - b
+        from_a = torch.minimum((-a0).clamp_min(0), width0)  # c - a, without cancellation
+        from_b = -torch.minimum(b0.clamp_min(0), width0)  # c - b
         along_a = torch.exp(torch.log1p(-p) + 0.5 * (offset + from_a) * (offset + (c0 + a0)))
         along_b = torch.exp(torch.log(p) + 0.5 * (offset + from_b) * (offset + (c0 + b0)))
         along_u = torch.exp(log_window(a0, b0, width0) + 0.5 * offset * (offset + 2 * c0))
@@ -280,7 +277,7 @@ def _offset_small(p: Tensor, q: Tensor, low: Tensor, high: Tensor, width: Tensor
 def wrapped_normal_log_prob(x: Tensor, std: Tensor) -> Tensor:
     """Log density per radian at angle x of a centred normal of standard deviation `std` wrapped around the circle.
 
-    Two regimes (FORMULAS E2): images `x + 2 pi k` summed relative to the nearest for std <= 2, Fourier series above.
+    Two regimes: images `x + 2 pi k` summed relative to the nearest for std <= 2, Fourier series above.
     Source: chapter eqs (21), (24), corrected.
     """
     x, wide = wrap(x), std > 2

@@ -54,8 +54,8 @@ class CosineHalfLaw(BatchFields, AzimuthalDistribution):
 class CosineHalf(Azimuthal):
     """N_R = N_TRT of the simplified model: `p(phi) = cos(phi/2) / 4`, `phi = 2 asin(2 u - 1)`.
 
-    Chapter eqs (25)-(31) with the inverse CDF corrected (FORMULAS E3); by atan2, so that cos(phi/2) = 2 sqrt(u (1 -
-    u)) is never negative. No parameters.
+    Chapter eqs (25)-(31) with the inverse CDF corrected. By atan2, so that cos(phi/2), which is 2 sqrt(u (1 - u)), is
+    never negative. No parameters.
     """
 
     def forward(self, context: Context) -> CosineHalfLaw:
@@ -77,8 +77,8 @@ class WrappedGaussianLaw(BatchFields, AzimuthalDistribution):
     def scattered_log_prob(self, phi: Tensor, theta_i: Tensor) -> Tensor:
         """`(1/pi) sum_k [Phi((d + pi/2 + 2 pi k) / std) - Phi((d - pi/2 + 2 pi k) / std)]`, d = wrap(phi - pi).
 
-        Above std = 0.9 by its Fourier series, `(1 / 2 pi) (1 + 2 sum_k e^{-k^2 std^2 / 2} cos(k d) sin(k pi/2) / (k
-        pi/2))`.
+        Above std = 0.9 by its Fourier series: `1 / 2 pi` times `1 + 2 sum_k e^{-k^2 std^2 / 2} cos(k d) s_k` with
+        `s_k = sin(k pi/2) / (k pi/2)`.
         """
         d = wrap(phi - math.pi).abs()
         narrow, wide = self.std < _NARROW[phi.dtype], self.std > 0.9
@@ -197,21 +197,21 @@ class Scatterable(Protocol):
 class ScatteredLaw(BatchFields, AzimuthalDistribution):
     """The base law turned by a uniform angle in [-pi/2, pi/2]; see `Scattered`."""
 
-    base: AzimuthalDistribution
+    base: Scatterable
     dimension: int = 2
 
     def sample(self, u: Tensor, theta_i: Tensor) -> Tensor:
         return wrap(self.base.sample(u[..., :1], theta_i) + math.pi * (u[..., 1] - 0.5))
 
     def log_prob(self, phi: Tensor, theta_i: Tensor) -> Tensor:
-        return self.base.scattered_log_prob(phi, theta_i)  # type: ignore[attr-defined]
+        return self.base.scattered_log_prob(phi, theta_i)
 
 
 class Scattered(Azimuthal):
     """N^G of a base law: `(1/pi) int_{-pi/2}^{pi/2} p(wrap(phi - phi')) dphi'`, chapter eqs (11), (37).
 
     Sampled exactly: phi0 from the base law, then `phi = wrap(phi0 + pi (v - 1/2))`; the density is the base law's
-        closed form `scattered_log_prob` (FORMULAS C, E8). Takes two uniforms.
+    closed form `scattered_log_prob`. Takes two uniforms.
 
     Args:
         base: `CosineHalf`, `WrappedGaussian`, `TruncatedGaussian`, a uniform law, or any law of one uniform whose

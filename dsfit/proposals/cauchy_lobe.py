@@ -48,7 +48,7 @@ class CauchyInclination(BatchFields, LongitudinalDistribution):
 
 
 class CauchyLobe(Longitudinal):
-    """`theta_h - mean ~ Cauchy(scale)` truncated to [L, H] = theta_r / 2 -+ pi / 4 (Ou et al. 2012; FORMULAS E9).
+    """`theta_h - mean ~ Cauchy(scale)` truncated to [L, H] = theta_r / 2 -+ pi / 4 (Ou et al. 2012).
 
     Per radian of theta_i: `scale / (2 (A - B) (t^2 + scale^2))`, t = theta_h - mean, A, B = atan of the ends over
         scale. Its tails dominate every Gaussian, which keeps weights bounded in multiple importance sampling; it

@@ -27,7 +27,7 @@ class FrozenAverages:
     """Dual scattering averages at the specular guess theta_in = -theta_r: mean over channels, detached.
 
     A sampler does not know theta_i yet, so what depends on it is evaluated at the mirror direction and kept the same
-    in `sample` and in `log_prob`; the density stays exact, only its shape is a guess (FORMULAS E7). The averages of
+    in `sample` and in `log_prob`; the density stays exact, only its shape is a guess. The averages of
     the last contexts are kept, because a fit asks for the same ones over and over; make a new object after changing
     the fibre in place.
 

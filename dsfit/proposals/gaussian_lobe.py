@@ -17,7 +17,7 @@ class GaussianLobe(Longitudinal):
     """`theta_h ~ N(mean, std)` truncated to [L, H] = theta_r / 2 -+ pi / 4, then `theta_i = 2 theta_h - theta_r`.
 
     Density per radian of theta_i: `g(theta_h - mean; std) / (2 Z)`. This is chapter eqs (12), (16)-(20) corrected:
-        reachable interval, normalisation Z and Jacobian 2 (FORMULAS E1). Sampled by inverse CDF.
+        reachable interval, normalisation Z and Jacobian 2. Sampled by inverse CDF.
 
     Args:
         mean: centre in theta_h, radians (alpha_X), a number or a tensor that broadcasts to the context batch.

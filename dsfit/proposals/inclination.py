@@ -55,8 +55,7 @@ class TruncatedGaussianInclination(BatchFields, LongitudinalDistribution):
         theta_r, mean, std: `[*batch]`, radians; anything that broadcasts, from a parameter or from a network.
         variable: "half", "diff" (both with [L, H] = theta_r / 2 -+ pi / 4 and Jacobian 1/2) or "in" ([-pi/2, pi/2], 1).
 
-    `sample` is the inverse CDF, reparametrised: differentiable in mean, std, theta_r and u. Source: FORMULAS E1, E5,
-    E7, E8.
+    `sample` is the inverse CDF, reparametrised: differentiable in mean, std, theta_r and u.
     """
 
     theta_r: Tensor

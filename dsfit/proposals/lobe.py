@@ -27,7 +27,7 @@ class Lobe(Product):
     Raises:
         InputError: another name, gamma_tt missing, or a value outside its bounds.
 
-    Source: chapter eqs (12), (21), (25) with the samplers corrected (FORMULAS E1-E3, E8).
+    Source: chapter eqs (12), (21), (25) with the samplers corrected.
     """
 
     def __init__(

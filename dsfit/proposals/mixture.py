@@ -33,8 +33,7 @@ class MixtureDistribution(Distribution):
 
     The first uniform selects the component, the others are its own; `dimension = 1 + max_k dimension_k`. A component
     is sampled only where it was selected, if it supports `select`; otherwise everywhere. Samples are differentiable
-    in the parameters of the
-    selected component, not in the weights: selection is a step function.
+    in the parameters of the selected component, not in the weights: selection is a step function.
     """
 
     def __init__(self, components: Sequence[Distribution], log_weights: Tensor) -> None:
@@ -108,8 +107,8 @@ class MixtureDistribution(Distribution):
 class Mixture(Proposal):
     """Mixture with learnable weights: `p = (1 - defensive) sum_k softmax(logits)_k p_k + defensive / (4 pi)`.
 
-    The defensive share of the uniform sphere bounds every weight `f / p` by `4 pi f / defensive` (FORMULAS E11):
-    Gaussian lobes have lighter tails than the BSDF, and f^2 / p is only integrable where the tails of p dominate.
+    The defensive share of the uniform sphere bounds every weight `f / p` by `4 pi f / defensive`: Gaussian lobes have
+    lighter tails than the BSDF, and f^2 / p is only integrable where the tails of p dominate.
 
     Args:
         components: proposals.
@@ -136,7 +135,7 @@ class Mixture(Proposal):
             raise InputError("components", components, "at least one proposal")
         if not 0 <= defensive < 1:
             raise InputError("defensive", defensive, "numbers in [0, 1)")
-        given = torch.ones(len(components)) if weights is None else torch.as_tensor(weights)
+        given = torch.ones(len(components)) if weights is None else torch.as_tensor(weights, dtype=torch.float64)
         given = check_range("weights", given.detach().to(torch.float64), 0.0, open_low=True)
         if given.dim() == 0 or given.shape[-1] != len(components):
             raise InputError("weights", tuple(given.shape), f"one weight for each of {len(components)} components")

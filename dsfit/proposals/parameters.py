@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from dsfit.context import Context
-from dsfit.errors import InputError, check_range
+from dsfit.errors import check_finite, check_range
 from dsfit.frame import HALF_PI
 
 STD_BOUNDS = (1e-5, 1e2)
@@ -65,9 +65,10 @@ class Bounded(nn.Module):
         self, field: str, value: Any, low: float, high: float, *, log: bool = False, learnable: bool = True
     ) -> None:
         super().__init__()
-        tensor = value.detach().clone() if isinstance(value, Tensor) else torch.tensor(value)
-        if not (isinstance(value, Tensor) and value.is_floating_point()):
-            tensor = tensor.to(torch.float64)
+        if isinstance(value, Tensor) and value.is_floating_point():
+            tensor = value.detach().clone()
+        else:
+            tensor = torch.as_tensor(value, dtype=torch.float64)
         self.low, self.high, self.log, self.learnable = low, high, log, learnable
         raw = to_raw(field, tensor, low, high, log)
         if learnable:
@@ -109,10 +110,8 @@ class Given(nn.Module):
         super().__init__()
         self.function: Callable[[Context], Tensor] | None = None
         if isinstance(value, Tensor) or not callable(value):
-            tensor = torch.as_tensor(value)
-            if tensor.is_complex():
-                raise InputError(field, value, "real numbers, or a function of the context")
-            self.register_buffer("value", check_range(field, tensor.detach().clone().to(torch.float64)))
+            tensor = torch.as_tensor(value, dtype=torch.float64).detach().clone()
+            self.register_buffer("value", check_finite(field, tensor))
         else:
             self.function = value
 

@@ -17,7 +17,7 @@ Value = float | Tensor | Callable[[Context], Tensor]
 
 
 class ScatteredLobe(Longitudinal):
-    """M^G of chapter eq (10): a Gaussian lobe widened by n forward scattering events (FORMULAS E8).
+    """M^G of chapter eq (10): a Gaussian lobe widened by n forward scattering events.
 
     `theta_h ~ N(mean, sqrt(std^2 + n beta_f^2))` truncated to [L, H]; n is the context's hint.
 
@@ -42,7 +42,7 @@ class ScatteredLobe(Longitudinal):
 
 
 class BackScatterLobe(Longitudinal):
-    """The longitudinal part of f_back, chapter eq (7): `theta_h ~ N(Delta_b, sigma)` truncated to [L, H] (FORMULAS E7).
+    """The longitudinal part of f_back, chapter eq (7): `theta_h ~ N(Delta_b, sigma)` truncated to [L, H].
 
     `sigma = scale sqrt(sigma_b^2 + n beta_f^2)` and the centre is `delta_b + shift`; scale = 1 and shift = 0 to start
     with.

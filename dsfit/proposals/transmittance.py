@@ -44,7 +44,7 @@ class TransmittanceCosine(Longitudinal):
     """theta_diff of density `cos(theta_diff) / (sqrt 2 cos(theta_r/2))` on [L, H], so theta_i = theta_r - 2 theta_diff.
 
     Chapter eqs (33)-(35) corrected: the normalisation is that of the reachable interval and the inverse CDF is
-    `asin(sin L + u (sin H - sin L))` (FORMULAS E4). No parameters.
+    `asin(sin L + u (sin H - sin L))`. No parameters.
     """
 
     def forward(self, context: Context) -> TransmittanceCosineInclination:
@@ -52,7 +52,7 @@ class TransmittanceCosine(Longitudinal):
 
 
 class TransmittanceGaussian(Longitudinal):
-    """Truncated Gaussian in theta_diff, or in theta_i: the transmittance law with a width to tune (FORMULAS E5).
+    """Truncated Gaussian in theta_diff, or in theta_i: the transmittance law with a width to tune.
 
     Args:
         width: standard deviation, radians; the classic parameter to tune against a_f^n, which narrows as n grows.

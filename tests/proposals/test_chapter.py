@@ -1,4 +1,4 @@
-"""The chapter's proposals by name, their parameters, and values that the formula sheet gives."""
+"""The chapter's proposals by name, their parameters, and values of their laws."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_round_trips_of_module_state() -> None:
 
 
 def test_scattered_cosine_values() -> None:
-    """N^G of cos(phi/2), whose integral is 4 (sections C and H of the sheet)."""
+    """N^G of cos(phi/2), whose integral is 4."""
     law = Scattered(CosineHalf())(Context(0.0, dtype=torch.float64))
     phi = f64([0.0, 0.5, math.pi / 2, 2.0, 2.8, math.pi])
     expected = f64([2 * math.sqrt(2) / math.pi, 0.8723276622, 2 / math.pi, 0.5156494875, 0.3860230741, 0.37292322857])

@@ -57,6 +57,11 @@ def test_shapes_dtypes_and_devices() -> None:
     assert not list(fixed.parameters()) and not fixed.constrained() and len(fixed.state_dict()) == 2
 
 
+def test_numbers_keep_double_precision() -> None:
+    assert GaussianLobe(0.1, 0.3).mean().item() == pytest.approx(0.1, rel=1e-14)
+    assert Given("x", 0.1)(Context(0.0, dtype=torch.float64)).item() == 0.1
+
+
 def test_given_is_detached_and_may_follow_the_context() -> None:
     slope = torch.tensor(2.0, requires_grad=True)
     value = Given("x", lambda context: slope * context.theta_r)(Context([0.5], dtype=torch.float64))

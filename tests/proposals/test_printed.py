@@ -46,7 +46,7 @@ def test_control_is_rejected(name: str) -> None:
 
 
 def test_totals_are_those_of_the_errata() -> None:
-    """What the claimed densities integrate to: the slips have the size that the formula sheet derives."""
+    """What the claimed densities integrate to: the slips have the size that the algebra gives."""
     assert verdict("lobe_as_printed", 0.0)[0] == pytest.approx(
         2 * math.pi * math.cos(15 * DEG) * math.exp(-((7.5 * DEG) ** 2) / 2)
     )
