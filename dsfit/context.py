@@ -23,8 +23,8 @@ class Context:
         v: hint for the directly lit share in [0, 1]; left out, it is 1 where n = 0 and 0 elsewhere.
         dtype: dtype of all fields; left out, that of the first tensor given, else float64.
 
-    All fields are broadcast to one batch shape. Context dimensions are the last ones of any sample: `omega` drawn for a context of
-    shape `[*batch]` has shape `[*samples, *batch, 2]`.
+    All fields are broadcast to one batch shape. Context dimensions are the last ones of any sample: `omega` drawn for
+    a context of shape `[*batch]` has shape `[*samples, *batch, 2]`.
 
     Raises:
         InputError: a field is not finite or out of range.

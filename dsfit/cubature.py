@@ -1,9 +1,9 @@
 """Adaptive cubature over the sphere of directions, in cells that follow curved edges of the integrand.
 
 A cell is an interval of theta times one segment of azimuth between two edges phi_j(theta), phi_{j+1}(theta), mapped by
-`phi = phi_j + (phi_{j+1} - phi_j) sin^2(pi s / 2)`. The map gathers nodes at both ends and turns half-integer powers there (a caustic, a
-support edge) into analytic functions. Each cell is integrated by two Gauss rules without common nodes; their difference is the
-error bound of the better one, and decides where to refine.
+`phi = phi_j + (phi_{j+1} - phi_j) sin^2(pi s / 2)`. The map gathers nodes at both ends and turns half-integer powers
+there (a caustic, a support edge) into analytic functions. Each cell is integrated by two Gauss rules without common
+nodes; their difference is the error bound of the better one, and decides where to refine.
 """
 
 from __future__ import annotations
@@ -76,7 +76,9 @@ class Cubature:
 
 
 def nodes_of(cells: Cells, edges: Callable[[Tensor], Tensor], count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """theta, phi and weight `[M, count, count]` (theta first) of the tensor Gauss rule in each cell; sum w f = int f dtheta dphi."""
+    """theta, phi and weight `[M, count, count]` (theta first) of the tensor Gauss rule in each cell; sum w f = int f
+    dtheta dphi.
+    """
     x, w = gauss_legendre(count, cells.theta_low.dtype)
     half_theta = ((cells.theta_high - cells.theta_low) / 2)[:, None]
     theta = cells.theta_low[:, None] + half_theta * (1 + x)
@@ -130,16 +132,18 @@ def integrate(
     rtol: float,
     max_evaluations: int,
 ) -> Cubature:
-    """Integrate `function(theta, phi) -> [..., K]` over theta in [breaks[0], breaks[-1]] and phi between the outer edges.
+    """Integrate `function(theta, phi) -> [..., K]` over theta in [breaks[0], breaks[-1]] and phi between the outer
+    edges.
 
     Args:
         theta_breaks: increasing ends of the first panels; nodes must see every peak, so put breaks at narrow ones.
         edges: theta `[...]` to sorted azimuths `[..., J + 1]`; segments of no width are allowed.
         rtol: wanted error of each integral, relative to it (integrals below 1e-6 of the largest count as that).
-        max_evaluations: give up refining beyond this; `converged` is then False and the error bound says what was reached.
+        max_evaluations: give up refining beyond this; `converged` is then False and the error bound says what was
+            reached.
 
-    The error bound is the sum over cells of |Gauss 10 - Gauss 7|, which overestimates the error of Gauss 10 by orders of magnitude where
-    the integrand is smooth, plus rounding.
+    The error bound is the sum over cells of |Gauss 10 - Gauss 7|, which overestimates the error of Gauss 10 by orders
+    of magnitude where the integrand is smooth, plus rounding.
     """
     with torch.no_grad():
         segments = edges(theta_breaks[:1]).shape[-1] - 1

@@ -43,7 +43,8 @@ def check_range(
     open_low: bool = False,
     open_high: bool = False,
 ) -> Tensor:
-    """Return `value` if every element is finite and in [low, high] (ends excluded as asked), else raise `InputError`."""
+    """Return `value` if every element is finite and in [low, high] (ends excluded as asked), else raise `InputError`.
+    """
     check_finite(field, value)
     data = value.detach()
     bad = (data <= low) if open_low else (data < low)

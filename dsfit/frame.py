@@ -1,8 +1,10 @@
-"""Angles of the fibre frame: u = tangent, v = normal, w = binormal; theta from the normal plane, phi around the tangent.
+"""Angles of the fibre frame: u = tangent, v = normal, w = binormal; theta from the normal plane, phi around the
+tangent.
 
 A direction is `omega = [..., 2] = (theta, phi)` in radians or a unit vector `[..., 3]` in (tangent, normal, binormal):
-`(sin theta, cos theta cos phi, cos theta sin phi)`. Both omega_i (to the light) and omega_r (to the viewer) point away from
-the fibre. Relative azimuth: `phi = wrap(phi_r - phi_i)`; |phi| = 0 is back scattering, |phi| = pi is forward scattering.
+`(sin theta, cos theta cos phi, cos theta sin phi)`. Both omega_i (to the light) and omega_r (to the viewer) point away
+from the fibre. Relative azimuth: `phi = wrap(phi_r - phi_i)`; |phi| = 0 is back scattering, |phi| = pi is forward
+scattering.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ TWO_PI = 2 * math.pi
 def wrap(angle: Tensor) -> Tensor:
     """Angle modulo 2 pi in [-pi, pi], with derivative 1 everywhere.
 
-    `wrap(x) = x - 2 pi round(x / (2 pi))`; the multiple of 2 pi is a constant to autograd, so there is no spurious jump term.
+    `wrap(x) = x - 2 pi round(x / (2 pi))`; the multiple of 2 pi is a constant to autograd, so there is no spurious
+    jump term.
     """
     return angle - TWO_PI * torch.round(angle.detach() / TWO_PI)
 
@@ -27,8 +30,8 @@ def wrap(angle: Tensor) -> Tensor:
 def cos_inclination(theta: Tensor) -> Tensor:
     """cos(theta) for an inclination in [-pi/2, pi/2], never zero or negative.
 
-    Rounded to float32, pi/2 is too large and its cosine is negative; densities per steradian divide by this number and integrands
-    multiply by it, so both must use the same positive value for the weight to stay finite.
+    Rounded to float32, pi/2 is too large and its cosine is negative; densities per steradian divide by this number and
+    integrands multiply by it, so both must use the same positive value for the weight to stay finite.
     """
     return torch.cos(theta).clamp_min(torch.finfo(theta.dtype).eps ** 2)
 

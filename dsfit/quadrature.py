@@ -16,7 +16,9 @@ def _legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.polynomial.legendre.leggauss(count)
 
 
-def gauss_legendre(count: int, dtype: torch.dtype = torch.float64, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
+def gauss_legendre(
+    count: int, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+) -> tuple[Tensor, Tensor]:
     """Nodes in (-1, 1) and weights (summing to 2) of the Gauss-Legendre rule."""
     x, w = _legendre(count)
     return torch.as_tensor(x, dtype=dtype, device=device), torch.as_tensor(w, dtype=dtype, device=device)
@@ -38,12 +40,13 @@ class PiecewiseChebyshev:
     Args:
         function: maps `[M]` points to values `[M, ...]`.
         breaks: increasing panel ends to start from.
-        tolerance: panels whose two last coefficients exceed `tolerance` times the panel's largest value (of any component, and at
-            least 1e-3 of the largest seen anywhere) are halved.
+        tolerance: panels whose two last coefficients exceed `tolerance` times the panel's largest value (of any
+            component, and at least 1e-3 of the largest seen anywhere) are halved.
         degree: degree of the series.
         max_depth: how often a panel may be halved.
 
-    Values keep their autograd graph, so the interpolant is differentiable in whatever `function` closes over and in the argument.
+    Values keep their autograd graph, so the interpolant is differentiable in whatever `function` closes over and in
+    the argument.
     """
 
     def __init__(
@@ -70,7 +73,8 @@ class PiecewiseChebyshev:
             largest = max(largest, float(scale.max()))
             scale = scale.clamp_min(max(1e-3 * largest, torch.finfo(values.dtype).tiny))
             error = (tail / scale[:, None]).amax(-1)
-            # halving should cut the tail by far more than 4; where it does not, rounding (or an end point) is all that is left
+            # halving should cut the tail by far more than 4; where it does not, rounding (or an end point) is all
+            # that is left
             bad = (error > tolerance) & (error < 0.25 * parent) & (depth < max_depth)
             done.append((low[~bad], high[~bad], coefficients[~bad]))
             if not bool(bad.any()):
@@ -129,7 +133,8 @@ def graded_ends(low: float, high: float, levels: int = 30, ratio: float = 0.5) -
 
 
 def panel_points(breaks: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Composite Gauss-Legendre nodes and weights on consecutive panels `breaks[..., k], breaks[..., k + 1]`; `[..., panels * count]`.
+    """Composite Gauss-Legendre nodes and weights on consecutive panels `breaks[..., k], breaks[..., k + 1]`; `[...,
+    panels * count]`.
 
     Panels of zero width contribute nothing, so callers may clamp breaks into a moving interval.
     """

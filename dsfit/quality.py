@@ -1,7 +1,8 @@
 """How good a density can be, and how good a given one is, by deterministic quadrature with an error bound.
 
 For f = integrand(omega) with channels, `|f|` its Euclidean norm, the second moment of any density p per steradian is
-`M(p) = int |f|^2/p domega >= M* = (int |f| domega)^2`; `excess(p) = M(p)/M* - 1 = int (p* - p)^2/p domega` with p* = |f|/int |f|.
+`M(p) = int |f|^2/p domega >= M* = (int |f| domega)^2`; `excess(p) = M(p)/M* - 1 = int (p* - p)^2/p domega` with p* =
+|f|/int |f|.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from dsfit.frame import cos_inclination, wrap
 from dsfit.proposals.base import Distribution, Proposal
 from dsfit.scene.integrand import Integrand
 
-_NODE_COUNT = 8
+_NODE_COUNT = 6
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,9 @@ class Reference:
 
 @dataclass(frozen=True)
 class Nodes:
-    """Quadrature nodes of one context: omega `[Q, 2]`, solid-angle weights `[Q]` (sum w f ~ int f domega), values `[Q, C]`."""
+    """Quadrature nodes of one context: omega `[Q, 2]`, solid-angle weights `[Q]` (sum w f ~ int f domega), values
+    `[Q, C]`.
+    """
 
     omega: Tensor
     weight: Tensor
@@ -75,9 +78,11 @@ class Excess:
     converged: bool
 
 
-def _domain(integrand: Integrand, context: Context, even: bool) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+def _domain(
+    integrand: Integrand, context: Context, even: bool, coarse: bool = False
+) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
     def edges(theta: Tensor) -> Tensor:
-        found = integrand.azimuth_edges(context, theta)
+        found = integrand.azimuth_edges(context, theta, coarse=coarse)
         return found.clamp_min(0.0)[..., found.shape[-1] // 2 :] if even else found
 
     return integrand.theta_breaks(context), edges
@@ -90,9 +95,12 @@ def _cubature(
     rtol: float,
     max_evaluations: int,
     even: bool,
+    coarse: bool = False,
 ) -> Cubature:
-    """Integrate `columns(omega, f) -> [..., K]` over the sphere; half of it, doubled, if everything is even in azimuth."""
-    breaks, edges = _domain(integrand, context, even)
+    """Integrate `columns(omega, f) -> [..., K]` over the sphere; half of it, doubled, if everything is even in
+    azimuth.
+    """
+    breaks, edges = _domain(integrand, context, even, coarse)
     factor = 2.0 if even else 1.0
 
     def function(theta: Tensor, phi: Tensor) -> Tensor:
@@ -109,8 +117,8 @@ def reference(
 ) -> Reference:
     """int f domega, its norm and M*, by adaptive cubature that follows the lobes, edges and lights.
 
-    The bound sums |Gauss 10 - Gauss 7| over cells. `converged` is False where `max_evaluations` per context did not suffice; the error
-    bound then says what was reached. Float64 throughout.
+    The bound sums |Gauss 10 - Gauss 7| over cells. `converged` is False where `max_evaluations` per context did not
+    suffice; the error bound then says what was reached. Float64 throughout.
 
     Raises:
         InputError: `rtol` is not in (0, 1).
@@ -144,9 +152,10 @@ def reference(
 
 
 def quadrature_nodes(
-    integrand: Integrand, context: Context, rtol: float = 1e-4, *, even: bool = False, count: int = _NODE_COUNT
+    integrand: Integrand, context: Context, rtol: float = 1e-3, *, even: bool = False, count: int = _NODE_COUNT
 ) -> Nodes:
-    """Nodes for fits: the cells that integrate |f| to `rtol`, each with a tensor Gauss rule of `count` x `count` points.
+    """Nodes for fits: the cells that integrate |f| to `rtol`, each with a tensor Gauss rule of `count` x `count`
+    points.
 
     Args:
         context: a single context (batch shape `()`).
@@ -164,9 +173,10 @@ def quadrature_nodes(
         rtol,
         2_000_000,
         symmetric,
+        coarse=True,
     )
     with torch.no_grad():
-        theta, phi, weight = nodes_of(found.cells, _domain(integrand, context, symmetric)[1], count)
+        theta, phi, weight = nodes_of(found.cells, _domain(integrand, context, symmetric, coarse=True)[1], count)
         keep = (weight > 0).flatten()
         theta, phi = theta.flatten()[keep], phi.flatten()[keep]
         weight = weight.flatten()[keep] * cos_inclination(theta)

@@ -21,8 +21,8 @@ def attenuation(
 ) -> Tensor:
     """A(p, h), shape `[..., C]`: A(0) = F; A(p) = (1 - F)^2 F^(p - 1) T^p.
 
-    T = exp(-2 sigma' cos gamma_t) ("geometric", Zinke and Weber 2007 eq 20) or exp(-4 sigma' cos^2 gamma_t) ("printed2003", Marschner et al.
-    2003), sigma' = sigma_a / cos(theta_t).
+    T = exp(-2 sigma' cos gamma_t) ("geometric", Zinke and Weber 2007 eq 20) or exp(-4 sigma' cos^2 gamma_t)
+    ("printed2003", Marschner et al. 2003), sigma' = sigma_a / cos(theta_t).
     """
     reflected, transmitted = fresnel(refraction.eta, refraction.cos_diff * cos_gamma)
     if p == 0:
@@ -46,7 +46,8 @@ def integrate_offsets(
 ) -> Tensor:
     """(1/2) int A(p, h) w dh over h = sin(gamma), gamma in [low, high], by Gauss-Legendre in gamma; shape `[..., C]`.
 
-    In gamma the integrand is analytic (dh = cos(gamma) d gamma removes the square roots at |h| = 1). `weight(gamma)` is an optional factor.
+    In gamma the integrand is analytic (dh = cos(gamma) d gamma removes the square roots at |h| = 1). `weight(gamma)`
+    is an optional factor.
     """
     x, w = gauss_legendre(nodes, low.dtype, low.device)
     half = (high - low).unsqueeze(-1) / 2
@@ -74,9 +75,9 @@ def forward_backward_energies(
 ) -> tuple[Tensor, Tensor]:
     """int N_p |phi|/pi dphi and int N_p (1 - |phi|/pi) dphi, each `[..., 3, C]`.
 
-    The weight is the share of light, incident uniformly over a half circle, that the exit azimuth phi carries into the opposite half
-    (Zinke et al. 2008, eqs 6 and 12, after the azimuth of incidence is integrated out). |phi| has a kink where TRT crosses
-    phi = 0, so its integral is split there.
+    The weight is the share of light, incident uniformly over a half circle, that the exit azimuth phi carries into the
+    opposite half (Zinke et al. 2008, eqs 6 and 12, after the azimuth of incidence is integrated out). |phi| has a kink
+    where TRT crosses phi = 0, so its integral is split there.
     """
     zero = torch.zeros_like(refraction[0].kappa)
     front, total = [], []
@@ -106,7 +107,9 @@ def _azimuth_share(p: int, kappa: Tensor):  # noqa: ANN202
 
 
 def _zero_azimuth(kappa: Tensor) -> Tensor:
-    """gamma at which TRT leaves at phi = 0: gamma = 2 gamma_t, i.e. cos gamma_t = 1/(2 kappa); 0 or pi/2 where there is none."""
+    """gamma at which TRT leaves at phi = 0: gamma = 2 gamma_t, i.e. cos gamma_t = 1/(2 kappa); 0 or pi/2 where there
+    is none.
+    """
     inside = (kappa > 0.5) & (kappa < math.sqrt(0.5))
     safe = torch.where(inside, kappa, 0.6)
     sin_gamma = torch.sqrt(1 - 1 / (4 * safe * safe)) / safe

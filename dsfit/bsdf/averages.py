@@ -47,11 +47,13 @@ class Averages:
 class LobeShares:
     """Forward and backward share of each lobe, a_f^p and a_b^p, at theta_in.
 
-    With K = c_M g(theta_h - alpha_p; beta_p) cos(theta_in) cos(theta_o) / cos^2(theta_diff),
-    `a_f^p(theta_in) = int K [int N_p |phi|/pi dphi] dtheta_o` and a_b^p with 1 - |phi|/pi (Zinke et al. 2008, eqs 6 and 12, reduced). In
-    theta_h, `cos(theta_in) cos(theta_o)/cos^2(theta_diff) = 1 - sin^2(theta_h)/cos^2(theta_diff)`, which is bounded by 1.
+    With K = c_M g(theta_h - alpha_p; beta_p) cos(theta_in) cos(theta_o) / cos^2(theta_diff), `a_f^p(theta_in) = int K
+    [int N_p |phi|/pi dphi] dtheta_o` and a_b^p with 1 - |phi|/pi (Zinke et al. 2008, eqs 6 and 12, reduced). In
+    theta_h, `cos(theta_in) cos(theta_o)/cos^2(theta_diff) = 1 - sin^2(theta_h)/cos^2(theta_diff)`, which is bounded by
+    1.
 
-    Two nested interpolants make this fast to the last digits: the azimuthal energies as functions of theta_diff, and the shares,
+    Two nested interpolants make this fast to the last digits: the azimuthal energies as functions of theta_diff, and
+        the shares,
     divided by cos(theta_in), as functions of theta_in. Both refine themselves; neither uses Monte Carlo or roots.
     """
 
@@ -74,7 +76,9 @@ class LobeShares:
         return value.select(-3, 0), value.select(-3, 1)
 
     def _jumps(self) -> Tensor:
-        """theta_diff where eta' = 2 or eta' = sqrt 2 for some orientation: the TRT share has a jump in its second derivative there."""
+        """theta_diff where eta' = 2 or eta' = sqrt 2 for some orientation: the TRT share has a jump in its second
+        derivative there.
+        """
         fiber = self.fiber
         etas = [fiber.eta] if fiber.is_round else [fiber.eta_trt(angle) for angle in self._orientations()]
         points = []
@@ -86,7 +90,9 @@ class LobeShares:
         return torch.stack(points) if points else torch.zeros(0, dtype=fiber.dtype)
 
     def _orientations(self) -> Tensor:
-        """phi_h over one period; the average over them is that of a periodic analytic function, for which the trapezium rule is exact."""
+        """phi_h over one period; the average over them is that of a periodic analytic function, for which the
+        trapezium rule is exact.
+        """
         return torch.arange(_ECCENTRIC_NODES, dtype=self.fiber.dtype) * (math.pi / _ECCENTRIC_NODES)
 
     def _energies_at(self, theta_diff: Tensor) -> Tensor:
@@ -116,7 +122,9 @@ class LobeShares:
         return torch.stack([front, back], dim=1)
 
     def _share_breaks(self) -> Tensor:
-        """Break points in theta_in: where a lobe leaves the reachable set, where it meets the kink at eta' = 2, and the ends."""
+        """Break points in theta_in: where a lobe leaves the reachable set, where it meets the kink at eta' = 2, and
+        the ends.
+        """
         fiber = self.fiber
         alpha, beta = fiber.alpha.detach(), fiber.beta.detach()
         offsets = torch.tensor([-9.0, -4.0, 0.0, 4.0, 9.0], dtype=alpha.dtype)
@@ -135,7 +143,9 @@ class LobeShares:
         return torch.stack(parts, dim=2).flatten(1)
 
     def _lobe_at(self, p: int, theta_in: Tensor) -> Tensor:
-        """a^p / cos(theta_in), `[M, 2, C]`, by composite Gauss-Legendre in theta_h on panels that follow the lobe and the kinks."""
+        """a^p / cos(theta_in), `[M, 2, C]`, by composite Gauss-Legendre in theta_h on panels that follow the lobe and
+        the kinks.
+        """
         fiber = self.fiber
         alpha, beta = fiber.alpha[p], fiber.beta[p]
         low, high = theta_in / 2 - math.pi / 4, theta_in / 2 + math.pi / 4
@@ -143,7 +153,8 @@ class LobeShares:
         around = (alpha.detach() + beta.detach() * steps).expand(len(theta_in), -1)
         kinks = self._kinks
         crossing = torch.cat([theta_in[:, None] + kinks, theta_in[:, None] - kinks, theta_in[:, None]], dim=1)
-        # near grazing the factor 1/cos^2(theta_diff) is a boundary layer at the end of the interval: geometric panels there
+        # near grazing the factor 1/cos^2(theta_diff) is a boundary layer at the end of the interval: geometric panels
+        # there
         grade = torch.tensor([0.25**k for k in range(1, 14)], dtype=theta_in.dtype) * HALF_PI
         layers = torch.cat([low[:, None] + grade, high[:, None] - grade], dim=1)
         breaks = torch.cat([low[:, None], high[:, None], around, crossing, layers], dim=1)
@@ -168,8 +179,8 @@ class LobeShares:
 def averages_from_shares(fiber: Fiber, convention: Convention, front: Tensor, back: Tensor, d_b: Tensor) -> Averages:
     """All averages from the lobes' forward and backward shares `[..., 3, C]`.
 
-    a_f = sum_p a_f^p; alpha_f = sum_p a_f^p alpha_p / a_f; beta_f^2 = sum_p a_f^p beta_p^2 / a_f (or beta_f by beta_p); likewise backward. R never
-    vanishes, so the denominators are positive.
+    a_f = sum_p a_f^p; alpha_f = sum_p a_f^p alpha_p / a_f; beta_f^2 = sum_p a_f^p beta_p^2 / a_f (or beta_f by
+    beta_p); likewise backward. R never vanishes, so the denominators are positive.
     """
     a_f, a_b = front.sum(-2), back.sum(-2)
     tiny = torch.finfo(a_f.dtype).tiny

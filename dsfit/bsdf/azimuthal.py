@@ -32,8 +32,9 @@ def azimuthal(
 ) -> Tensor:
     """N_p(theta_diff, phi) = (1/2) sum over roots of A(p, h) |dphi/dh|^-1, `[..., 3, C]`, per radian.
 
-    Even in phi. `marschner` treats the TRT caustic, `raw` leaves it (unbounded at the caustic), `simplified` is N_R, N_TRT ~ cos(phi/2),
-    N_TT ~ g(phi - pi; gamma_TT) (chapter eqs 21, 25) times each lobe's energy E_p; see `simplified_shapes`.
+    Even in phi. `marschner` treats the TRT caustic, `raw` leaves it (unbounded at the caustic), `simplified` is N_R,
+    N_TRT ~ cos(phi/2), N_TT ~ g(phi - pi; gamma_TT) (chapter eqs 21, 25) times each lobe's energy E_p; see
+    `simplified_shapes`.
     """
     theta_diff, phi = torch.broadcast_tensors(theta_diff, wrap(phi).abs())
     bent = refractions(fiber, theta_diff, phi_h)
@@ -66,7 +67,9 @@ def _n_r(fiber: Fiber, bent: Refraction, phi: Tensor, absorption: Absorption) ->
 
 
 def _n_tt(fiber: Fiber, bent: Refraction, phi: Tensor, absorption: Absorption) -> Tensor:
-    """TT: one ray for |phi| >= 2 asin(kappa), none otherwise; |dphi/dh|^-1 = cos g cos g_t (kappa cos g + cos g_t)/(2 (1 - kappa^2))."""
+    """TT: one ray for |phi| >= 2 asin(kappa), none otherwise; |dphi/dh|^-1 = cos g cos g_t (kappa cos g + cos g_t)/(2
+    (1 - kappa^2)).
+    """
     kappa = bent.kappa
     lit = phi > 2 * torch.asin(kappa)
     inside = torch.where(lit, phi, math.pi)
@@ -109,10 +112,12 @@ def _n_trt(fiber: Fiber, bent: Refraction, phi: Tensor, model: AzimuthalModel, a
 def azimuthal_scattered(
     fiber: Fiber, theta_diff: Tensor, phi: Tensor, phi_h: Tensor | None, model: AzimuthalModel, absorption: Absorption
 ) -> Tensor:
-    """N^G_p(phi) = (1/pi) int_{-pi/2}^{pi/2} N_p(theta_diff, wrap(phi - phi')) dphi', `[..., 3, C]`, per radian (eq 11 as a convolution).
+    """N^G_p(phi) = (1/pi) int_{-pi/2}^{pi/2} N_p(theta_diff, wrap(phi - phi')) dphi', `[..., 3, C]`, per radian (eq 11
+    as a convolution).
 
-    A difference of the cumulative azimuth, which is an integral over offsets and so smooth even where N_p is infinite; int N^G = int N.
-    For an eccentric fibre the index of TRT is that of the unscattered pair of directions (phi_h is held during the average).
+    A difference of the cumulative azimuth, which is an integral over offsets and so smooth even where N_p is infinite;
+    int N^G = int N. For an eccentric fibre the index of TRT is that of the unscattered pair of directions (phi_h is
+    held during the average).
     """
     theta_diff, phi = torch.broadcast_tensors(theta_diff, wrap(phi).abs())
     if not fiber.batch_shape and phi.numel() > _CHUNK:
@@ -127,7 +132,9 @@ def azimuthal_scattered(
 def _in_chunks(
     fiber: Fiber, theta_diff: Tensor, phi: Tensor, phi_h: Tensor | None, model: AzimuthalModel, absorption: Absorption
 ) -> Tensor:
-    """Hundreds of attenuations per direction: a few hundred directions at a time stay in cache (several times faster)."""
+    """Hundreds of attenuations per direction: a few hundred directions at a time stay in cache (several times
+    faster).
+    """
     shape = torch.broadcast_shapes(phi.shape, () if phi_h is None else phi_h.shape)
     given = [theta_diff, phi] if phi_h is None else [theta_diff, phi, phi_h]
     rows = [x.expand(shape).reshape(-1).split(_CHUNK) for x in given]
@@ -145,7 +152,9 @@ def azimuthal_constant(
 
 
 def support_edges(fiber: Fiber, theta_diff: Tensor, phi_h: Tensor | None = None) -> Tensor:
-    """|phi| in [0, pi] where some N_p starts, ends, or peaks: TT's edge, the TRT edge, the caustic; `[..., 3]`, sorted."""
+    """|phi| in [0, pi] where some N_p starts, ends, or peaks: TT's edge, the TRT edge, the caustic; `[..., 3]`,
+    sorted.
+    """
     bent = refractions(fiber, theta_diff, phi_h)
     caustic = Caustic.at(bent[2].kappa)
     edges = torch.broadcast_tensors(2 * torch.asin(bent[1].kappa), caustic.edge.abs(), caustic.phi)

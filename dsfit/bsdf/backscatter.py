@@ -1,7 +1,7 @@
 """Local back scattering by the hair around the shading point: A_b, Delta_b, sigma_b (Zinke et al. 2008, eqs 13-17).
 
-With x = a_f^2 and q = a_b/(1 - x) = r/(1 + a_f), r = a_b/(1 - a_f): r is in [0, 1] whenever a_f + a_b <= 1, so everything stays
-bounded as a_f goes to 1.
+With x = a_f^2 and q = a_b/(1 - x) = r/(1 + a_f), r = a_b/(1 - a_f): r is in [0, 1] whenever a_f + a_b <= 1, so
+everything stays bounded as a_f goes to 1.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ def backscatter_albedo(a_f: Tensor, a_b: Tensor) -> Tensor:
 def back_shift(a_f: Tensor, a_b: Tensor, alpha_f: Tensor, alpha_b: Tensor, sign: str = "minus") -> Tensor:
     """Delta_b = alpha_b (1 -+ 2 q^2) + alpha_f (2 + 4 a_f^2 q^2)/(1 - a_f^2), radians.
 
-    Published with the minus; averaging over events gives a plus (`sign="plus"`). Grows like 1/(1 - a_f^2), the mean number of forward events.
+    Published with the minus; averaging over events gives a plus (`sign="plus"`). Grows like 1/(1 - a_f^2), the mean
+    number of forward events.
     """
     q2 = _back_ratio(a_f, a_b) ** 2
     gap = ((1 - a_f) * (1 + a_f)).clamp_min(torch.finfo(a_f.dtype).eps)
@@ -40,10 +41,11 @@ def back_shift(a_f: Tensor, a_b: Tensor, alpha_f: Tensor, alpha_b: Tensor, sign:
 
 
 def back_width(a_f: Tensor, a_b: Tensor, beta_f: Tensor, beta_b: Tensor, d_b: Tensor | float) -> Tensor:
-    """sigma_b = (1 + d_b a_f^2) [sqrt(2 beta_f^2 + beta_b^2) + a_b^2 sqrt(2 beta_f^2 + 3 beta_b^2)] / [1 + a_b^2 (2 beta_f + 3 beta_b)].
+    """sigma_b = (1 + d_b a_f^2) [sqrt(2 beta_f^2 + beta_b^2) + a_b^2 sqrt(2 beta_f^2 + 3 beta_b^2)] / [1 + a_b^2 (2
+    beta_f + 3 beta_b)].
 
-    A standard deviation, eq 17 divided through by a_b so that a_b = 0 is regular. The denominator mixes a number with an angle: it holds in radians
-    only.
+    A standard deviation, eq 17 divided through by a_b so that a_b = 0 is regular. The denominator mixes a number with
+    an angle: it holds in radians only.
     """
     f2, b2, a2 = beta_f**2, beta_b**2, a_b**2
     top = torch.sqrt(2 * f2 + b2) + a2 * torch.sqrt(2 * f2 + 3 * b2)

@@ -15,8 +15,10 @@ class Convention:
     The defaults are the `consistent` convention.
 
     Attributes:
-        lobe_norm: factor c_M of every longitudinal lobe. "energy" is 1/2 (d theta_i = 2 d theta_h), "printed" is 1 (eq 12).
-        inverse_cos2: whether scattering terms carry 1 / cos^2(theta_diff), and back scattering 1 / (pi cos^2(theta_diff));
+        lobe_norm: factor c_M of every longitudinal lobe. "energy" is 1/2 (d theta_i = 2 d theta_h), "printed" is 1
+            (eq 12).
+        inverse_cos2: whether scattering terms carry 1 / cos^2(theta_diff), and back scattering 1 / (pi
+        cos^2(theta_diff));
             the chapter's (6), (7), (9) lost it.
         share: "complement": F = v F_direct + (1 - v) F_scatter; "sum": both added, v ignored, as (4) prints it.
         density_power: how often d_f multiplies the transmitted light: 1, or 2 as (8) with (32).
@@ -24,15 +26,20 @@ class Convention:
         scattered_azimuth: "convolution": N^G(phi) over the window centred on phi; "constant": eq (11), centred on 0.
         back_argument: centre of the back lobe in "theta_h" or, eq (7) literally, in "theta_diff + theta_r".
         back_width: sigma_f^2 widens back scattering in F_scatter alone ("scatter") or everywhere ("always", eq 7).
-        back_azimuth: back scattering leaves at "all" azimuths (published pseudo-code) or in the "back" half, |phi| < pi/2.
+        back_azimuth: back scattering leaves at "all" azimuths (published pseudo-code) or in the "back" half, |phi| <
+            pi/2.
         shift_sign: sign of 2 q^2 in Delta_b: "minus" as published, "plus" as the event average derives it.
-        absorption: per internal segment, "geometric" exp(-2 sigma' cos gamma_t) or "printed2003" exp(-4 sigma' cos^2 gamma_t).
-        split: share of forward light: "fraction" |phi| / pi (incident light over a half circle) or "half", |phi| > pi/2.
+        absorption: per internal segment, "geometric" exp(-2 sigma' cos gamma_t) or "printed2003" exp(-4 sigma' cos^2
+            gamma_t).
+        split: share of forward light: "fraction" |phi| / pi (incident light over a half circle) or "half", |phi| >
+            pi/2.
         mean_width: average of beta^2 ("variance") or of beta ("width").
         average_weight: cosine in the averages: "incident" cos(theta_in) (as published) or "outgoing" cos(theta_o).
-        average_angle: averages are taken at "theta_in" = theta_i, or at "theta_diff" as the chapter's a_f(theta_d) suggests.
+        average_angle: averages are taken at "theta_in" = theta_i, or at "theta_diff" as the chapter's a_f(theta_d)
+            suggests.
         limit_energy: whether a_f and a_b are divided by max(1, a_f + a_b).
-        simplified_energy: the simplified azimuths (21), (25) carry each lobe's "attenuation" integral, or are "printed" bare.
+        simplified_energy: the simplified azimuths (21), (25) carry each lobe's "attenuation" integral, or are
+            "printed" bare.
     """
 
     lobe_norm: Literal["energy", "printed"] = "energy"

@@ -57,8 +57,8 @@ class Fiber:
         eta: refractive index `[*batch]`, > 1.
         alpha: longitudinal shifts of the lobes in theta_h, `[*batch, 3]`.
         beta: longitudinal standard deviations of the lobes in theta_h, `[*batch, 3]`, > 0.
-        eccentricity: ratio of the axes of the section; changes the index that TRT sees. Between sqrt(1/2) and sqrt(2), where the index
-            of either axis would fall to 1.
+        eccentricity: ratio of the axes of the section; changes the index that TRT sees. Between sqrt(1/2) and sqrt(2),
+            where the index of either axis would fall to 1.
         caustic_width: standard deviation w_c of the glints' azimuth.
         glint_scale: energy factor k_G of the glints.
         caustic_fade: range of eta' above 2 over which the glint fades out.
@@ -66,7 +66,8 @@ class Fiber:
         gamma_tt: azimuthal standard deviation of TT in the simplified azimuths, eq (21).
         dtype: dtype of all fields; left out, that of the first tensor given, else float64.
 
-    A batch of fibres broadcasts against directions from the right like any tensor: give shape `[B, 1]` to evaluate `[B, Q]` directions.
+    A batch of fibres broadcasts against directions from the right like any tensor: give shape `[B, 1]` to evaluate
+        `[B, Q]` directions.
 
     Raises:
         InputError: a field is unknown, not finite, of the wrong shape, or out of range.
@@ -154,10 +155,11 @@ class Fiber:
         return not self.eccentricity.requires_grad and bool((self.eccentricity == 1).all())
 
     def eta_trt(self, phi_h: Tensor | None) -> Tensor:
-        """Index that TRT sees: eta* = [(eta1 + eta2) + cos(2 phi_h) (eta1 - eta2)] / 2 (Marschner et al. 2003, section 5.2.3).
+        """Index that TRT sees: eta* = [(eta1 + eta2) + cos(2 phi_h) (eta1 - eta2)] / 2 (Marschner et al. 2003,
+        section 5.2.3).
 
-        eta1 = 2 (eta - 1) a^2 - eta + 2, eta2 = 2 (eta - 1) a^-2 - eta + 2, a = eccentricity; equals eta for a = 1. `phi_h = (phi_i + phi_r)/2` is
-        measured from the major axis of the section; left out, it is 0.
+        eta1 = 2 (eta - 1) a^2 - eta + 2, eta2 = 2 (eta - 1) a^-2 - eta + 2, a = eccentricity; equals eta for a = 1.
+        `phi_h = (phi_i + phi_r)/2` is measured from the major axis of the section; left out, it is 0.
         """
         if self.is_round:
             return self.eta

@@ -1,4 +1,6 @@
-"""Treatment of the TRT caustic (Marschner et al. 2003, section 5.2.2): the singularity is replaced by a Gaussian glint."""
+"""Treatment of the TRT caustic (Marschner et al. 2003, section 5.2.2): the singularity is replaced by a Gaussian
+glint.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,9 @@ from dsfit.special import log_gauss
 class Glint:
     """The two Gaussians at +-phi_c, and the factor that removes the singular peaks.
 
-    With fade t (1 for eta' < 2, falling smoothly to 0 at eta' = 2 + Delta eta'):
-    `L <- L (1 - t e^{-(phi - phi_c)^2 / 2 w_c^2}) (1 - t e^{-(phi + phi_c)^2 / 2 w_c^2}) + t k_G A(2, h_c) Delta h [g(phi - phi_c; w_c) + g(phi + phi_c; w_c)]`
+    With fade t (1 for eta' < 2, falling smoothly to 0 at eta' = 2 + Delta eta'): `L <- L (1 - t e^{-(phi - phi_c)^2 /
+    2 w_c^2}) (1 - t e^{-(phi + phi_c)^2 / 2 w_c^2}) + t k_G A(2, h_c) Delta h [g(phi - phi_c; w_c) + g(phi + phi_c;
+    w_c)]`
     """
 
     fade: Tensor

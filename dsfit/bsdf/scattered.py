@@ -17,12 +17,14 @@ from dsfit.special import wrapped_normal_log_prob
 _SERIES = 4
 
 
-def offset_windows(fiber: Fiber, bent: tuple[Refraction, ...], phi: Tensor, model: str, absorption: Absorption) -> Tensor:
+def offset_windows(
+    fiber: Fiber, bent: tuple[Refraction, ...], phi: Tensor, model: str, absorption: Absorption
+) -> Tensor:
     """Window masses of R, TT, TRT at |phi| in [0, pi], `[..., 3, C]`.
 
-    A window of half width pi/2 around phi reaches over both sides of 0 (phi <= pi/2) or of pi. By symmetry its mass is a sum of
-    two one-sided masses, both between 0 and psi or both between psi and pi, so that nothing cancels:
-    phi <= pi/2: [0, pi/2 - phi] + [0, pi/2 + phi];  phi > pi/2: [phi - pi/2, pi] + [3 pi/2 - phi, pi].
+    A window of half width pi/2 around phi reaches over both sides of 0 (phi <= pi/2) or of pi. By symmetry its mass is
+    a sum of two one-sided masses, both between 0 and psi or both between psi and pi, so that nothing cancels: phi <=
+    pi/2: [0, pi/2 - phi] + [0, pi/2 + phi];  phi > pi/2: [phi - pi/2, pi] + [3 pi/2 - phi, pi].
     """
     near = phi <= HALF_PI
     first = (phi - HALF_PI).abs()
@@ -46,13 +48,17 @@ def _node_count(fiber: Fiber, model: str) -> int:
     return int(min(96, max(32, math.ceil(14 / math.sqrt(narrow)))))
 
 
-def _mass_r(bent: Refraction, sigma_a: Tensor, psi: Tensor, inner: Tensor, absorption: Absorption, nodes: int) -> Tensor:
+def _mass_r(
+    bent: Refraction, sigma_a: Tensor, psi: Tensor, inner: Tensor, absorption: Absorption, nodes: int
+) -> Tensor:
     low = torch.where(inner, 0.0, psi / 2)
     high = torch.where(inner, psi / 2, HALF_PI)
     return integrate_offsets(0, bent, sigma_a, low, high, absorption, nodes=nodes)
 
 
-def _mass_tt(bent: Refraction, sigma_a: Tensor, psi: Tensor, inner: Tensor, absorption: Absorption, nodes: int) -> Tensor:
+def _mass_tt(
+    bent: Refraction, sigma_a: Tensor, psi: Tensor, inner: Tensor, absorption: Absorption, nodes: int
+) -> Tensor:
     """TT leaves at pi for h = 0 and at 2 asin(kappa) for h = 1, so [psi, pi] holds gamma below the root."""
     edge = 2 * torch.asin(bent.kappa)
     lit = psi > edge
@@ -73,10 +79,11 @@ def _mass_trt(
     absorption: Absorption,
     nodes: int,
 ) -> Tensor:
-    """Offsets whose exit azimuth lies in [0, psi] (or [psi, pi]), both signs of h at once; `[..., C]` summed over the two windows.
+    """Offsets whose exit azimuth lies in [0, psi] (or [psi, pi]), both signs of h at once; `[..., C]` summed over the
+    two windows.
 
-    On h > 0, f rises to phi_c at gamma_c and falls to the edge; f in [0, psi] for gamma in [0, a] and [b, ...], and by symmetry
-    -f in [0, psi] continues to c, where a, b are the two roots of f = psi and c the root of f = -psi.
+    On h > 0, f rises to phi_c at gamma_c and falls to the edge; f in [0, psi] for gamma in [0, a] and [b, ...], and by
+    symmetry -f in [0, psi] continues to c, where a, b are the two roots of f = psi and c the root of f = -psi.
     """
     wide = bent.map(lambda x: x.unsqueeze(-1))
     kappa, psi = torch.broadcast_tensors(wide.kappa, psi)
@@ -114,7 +121,8 @@ def _removal(glint: Glint, kappa: Tensor):  # noqa: ANN202
 def simplified_windows(fiber: Fiber, phi: Tensor) -> Tensor:
     """Window masses of the unit-integral simplified azimuths in closed form, `[..., 3]`.
 
-    cos(phi/2)/4 gives (1/sqrt 2) cos(phi/2) for |phi| <= pi/2, 1 - (1/sqrt 2) sin(|phi|/2) beyond; the wrapped Gaussian a sum of normal masses.
+    cos(phi/2)/4 gives (1/sqrt 2) cos(phi/2) for |phi| <= pi/2, 1 - (1/sqrt 2) sin(|phi|/2) beyond; the wrapped
+    Gaussian a sum of normal masses.
     """
     root2 = math.sqrt(0.5)
     cosine = torch.where(phi <= HALF_PI, root2 * torch.cos(phi / 2), 1 - root2 * torch.sin(phi / 2))

@@ -1,14 +1,16 @@
 """Exit azimuths of a circular section by exact Snell refraction, and their inverse.
 
-Everything is written with `kappa = 1 / eta' = cos(theta_diff) / sqrt(eta^2 - sin^2 theta_diff)` in (0, 1 / eta], which stays finite at
-grazing, and with the incidence angle gamma on the section (h = sin gamma), sin gamma_t = kappa sin gamma. For offsets h >= 0:
+Everything is written with `kappa = 1 / eta' = cos(theta_diff) / sqrt(eta^2 - sin^2 theta_diff)` in (0, 1 / eta], which
+stays finite at grazing, and with the incidence angle gamma on the section (h = sin gamma), sin gamma_t = kappa sin
+gamma. For offsets h >= 0:
 
     R    phi = -2 gamma
     TT   phi = pi - 2 gamma + 2 gamma_t
     TRT  phi = f(gamma) = 4 gamma_t - 2 gamma      (mod 2 pi)
 
-and odd in h. f is concave on [0, pi/2]: f'' = -4 kappa (1 - kappa^2) sin(gamma) / cos^3(gamma_t). For kappa > 1/2 it rises from 0 to the
-caustic phi_c at gamma_c and falls to the edge 4 asin(kappa) - pi; for kappa <= 1/2 it falls all the way.
+and odd in h. f is concave on [0, pi/2]: f'' = -4 kappa (1 - kappa^2) sin(gamma) / cos^3(gamma_t). For kappa > 1/2 it
+rises from 0 to the caustic phi_c at gamma_c and falls to the edge 4 asin(kappa) - pi; for kappa <= 1/2 it falls all
+the way.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ _NEWTON_STEPS = 12
 
 @dataclass(frozen=True)
 class Refraction:
-    """Refraction at an inclination: kappa = 1 / eta', cos(theta_diff), and cos(theta_t) of the refracted inclination."""
+    """Refraction at an inclination: kappa = 1 / eta', cos(theta_diff), and cos(theta_t) of the refracted inclination.
+    """
 
     eta: Tensor
     cos_diff: Tensor
@@ -64,8 +67,8 @@ def exit_trt_slope(kappa: Tensor, gamma: Tensor) -> Tensor:
 def gamma_tt(kappa: Tensor, phi: Tensor) -> tuple[Tensor, Tensor]:
     """(sin gamma, cos gamma) of the one TT ray that leaves at |phi| in [2 asin(kappa), pi].
 
-    Closed form sin gamma = cos(phi/2) / r, cos gamma = (sin(phi/2) - kappa) / r, r^2 = 1 + kappa^2 - 2 kappa sin(phi/2) (the triangle of
-    the two radii; no root finding). Callers clamp phi into its range first.
+    Closed form sin gamma = cos(phi/2) / r, cos gamma = (sin(phi/2) - kappa) / r, r^2 = 1 + kappa^2 - 2 kappa
+    sin(phi/2) (the triangle of the two radii; no root finding). Callers clamp phi into its range first.
     """
     sin_half, cos_half = torch.sin(phi / 2), torch.cos(phi / 2)
     r = torch.sqrt((sin_half - kappa) ** 2 + cos_half * cos_half)
@@ -74,7 +77,9 @@ def gamma_tt(kappa: Tensor, phi: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class Caustic:
-    """Where TRT folds: gamma_c, phi_c (both 0 for kappa <= 1/2), the edge 4 asin(kappa) - pi, and whether there is a fold."""
+    """Where TRT folds: gamma_c, phi_c (both 0 for kappa <= 1/2), the edge 4 asin(kappa) - pi, and whether there is a
+    fold.
+    """
 
     folded: Tensor
     gamma: Tensor
@@ -95,8 +100,9 @@ class Caustic:
 def root_falling(kappa: Tensor, caustic: Caustic, phi: Tensor) -> Tensor:
     """gamma in [gamma_c, pi/2] with f(gamma) = phi, for phi in [edge, phi_c]; out-of-range phi goes to the nearer end.
 
-    Newton from the right of the root of a concave falling function converges monotonically; the start is the least of three
-    upper bounds on the root (linear, quadratic at the fold, cubic at kappa = 1/2), so it is good at the fold as well.
+    Newton from the right of the root of a concave falling function converges monotonically; the start is the least of
+    three upper bounds on the root (linear, quadratic at the fold, cubic at kappa = 1/2), so it is good at the fold as
+    well.
     """
     with torch.no_grad():
         y = torch.minimum(torch.maximum(phi, caustic.edge), caustic.phi)
@@ -117,7 +123,9 @@ def root_falling(kappa: Tensor, caustic: Caustic, phi: Tensor) -> Tensor:
 
 
 def root_rising(kappa: Tensor, caustic: Caustic, phi: Tensor) -> Tensor:
-    """gamma in [0, gamma_c] with f(gamma) = phi, for phi in [0, phi_c]; meaningful only where the fibre has a caustic."""
+    """gamma in [0, gamma_c] with f(gamma) = phi, for phi in [0, phi_c]; meaningful only where the fibre has a
+    caustic.
+    """
     with torch.no_grad():
         y = torch.minimum(phi.clamp_min(0.0), caustic.phi)
         tiny = torch.finfo(kappa.dtype).tiny
@@ -131,7 +139,9 @@ def root_rising(kappa: Tensor, caustic: Caustic, phi: Tensor) -> Tensor:
 
 
 def _attach(kappa: Tensor, gamma: Tensor, phi: Tensor) -> Tensor:
-    """Give a converged root its derivatives by the implicit function theorem: one Newton step with the slope held fixed."""
+    """Give a converged root its derivatives by the implicit function theorem: one Newton step with the slope held
+    fixed.
+    """
     slope = exit_trt_slope(kappa, gamma).detach()
     limit = torch.finfo(kappa.dtype).eps ** 0.5
     slope = torch.where(slope < 0, slope.clamp_max(-limit), slope.clamp_min(limit))

@@ -204,3 +204,22 @@ class Product(Proposal):
 
     def forward(self, context: Context) -> Distribution:
         return ProductDistribution(context, self.longitudinal(context), self.azimuthal(context))
+
+    def log_prob_with_jacobian(self, context: Context, omega: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """As for any proposal; where the azimuth has nothing to learn, only the longitudinal law is differentiated."""
+        if any(True for _ in self.azimuthal.parameters()) or len(context.batch_shape):
+            return super().log_prob_with_jacobian(context, omega)
+        with torch.no_grad():
+            value = self(context).log_prob(omega)
+        parameters = {name: x.detach() for name, x in self.longitudinal.named_parameters()}
+        if not parameters:
+            return value, {}
+
+        def log_prob(values: dict[str, Tensor], theta_i: Tensor, zero: Tensor) -> Tensor:
+            found = functional_call(self.longitudinal, values, (context,)).log_prob(theta_i)
+            return torch.where(zero, 0.0, found)
+
+        flat = omega[..., 0].reshape(-1), value.isinf().reshape(-1)
+        slopes = vmap(grad(log_prob), in_dims=(None, 0, 0))(parameters, *flat)
+        shape = omega.shape[:-1]
+        return value, {f"longitudinal.{name}": x.reshape(*shape, *x.shape[1:]) for name, x in slopes.items()}

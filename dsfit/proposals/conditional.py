@@ -47,8 +47,8 @@ class ConditionalAzimuth(AzimuthalDistribution):
         x = (position - column).clamp(0, 1)
         table, width = self.density.flatten(), columns + 1
         at = row * width + column
-        lower = torch.lerp(table[at], table[at + 1], x)
-        upper = torch.lerp(table[at + width], table[at + width + 1], x)
+        corners = [torch.take(table, at + k) for k in (0, 1, width, width + 1)]  # works on scalars under vmap too
+        lower, upper = torch.lerp(corners[0], corners[1], x), torch.lerp(corners[2], corners[3], x)
         density = torch.lerp(lower, upper, share.expand_as(lower)) / 2
         empty = density <= 0
         return torch.log(torch.where(empty, 1.0, density)).masked_fill(empty, -math.inf)

@@ -10,18 +10,20 @@ from torch import Tensor
 
 from dsfit.bsdf.attenuation import lobe_energies
 from dsfit.bsdf.azimuthal import refractions
+from dsfit.bsdf.breaks import theta_breaks
 from dsfit.bsdf.dual_scattering import DualScattering
 from dsfit.context import Context
-from dsfit.frame import HALF_PI, cos_inclination, reachable
-from dsfit.proposals.base import Product, Proposal
+from dsfit.frame import cos_inclination, theta_diff, theta_half
+from dsfit.proposals.base import Azimuthal, Product, Proposal
 from dsfit.proposals.conditional import FiberAzimuth, lobe_azimuths
 from dsfit.proposals.mixture import Mixture
 from dsfit.proposals.parameters import MEAN_BOUNDS
 from dsfit.proposals.split_lobe import SplitGaussianLobe
 from dsfit.proposals.uniform import BackHalf, UniformAzimuth
-from dsfit.special import truncated_normal_icdf
+from dsfit.quadrature import panel_points
+from dsfit.special import log_gauss
 
-_POINTS = 65
+_POINTS = 8
 _TABLES: weakref.WeakKeyDictionary[DualScattering, dict[bool, list[FiberAzimuth]]] = weakref.WeakKeyDictionary()
 
 
@@ -63,74 +65,67 @@ class StructuredProposal(Mixture):
 
 
 class _Start:
-    """Moments of each part of the integrand, which the components start from."""
+    """Longitudinal marginals of each part of the integrand, whose moments the components start from.
+
+    Each marginal is evaluated on Gauss panels that follow the lobes, for every context of the batch.
+    """
 
     def __init__(self, bsdf: DualScattering, context: Context) -> None:
         self.bsdf, self.context = bsdf, context
-        self.low, self.high = reachable(context.theta_r)
-        self.guess = bsdf.averages(-context.theta_r)
+        nodes = [panel_points(theta_breaks(bsdf, t), _POINTS) for t in context.theta_r]
+        count = max(len(x) for x, _ in nodes)
+        self.theta_i = torch.stack([torch.nn.functional.pad(x, (0, count - len(x))) for x, _ in nodes])
+        self.weight = torch.stack([torch.nn.functional.pad(w, (0, count - len(w))) for _, w in nodes])
+        theta_r = context.theta_r[:, None]
+        self.theta_h, self.diff = theta_half(self.theta_i, theta_r), theta_diff(self.theta_i, theta_r)
+        self.average = bsdf.averages(self.theta_i)
+        self.v, n = context.v[:, None, None], context.n[:, None, None]
+        self.variance_f = n * self.average.beta_f**2
+        self.passed = bsdf.d_f * torch.exp(n * torch.log(self.average.a_f.clamp_min(1e-300)))
 
     def components(self) -> list[tuple[str, float, Proposal]]:
         """Name, energy and proposal of every component that the contexts need."""
+        bsdf, fiber = self.bsdf, self.bsdf.fiber
         found: list[tuple[str, float, Proposal]] = []
         direct, scattered = bool((self.context.v > 0).any()), bool((self.context.v < 1).any())
-        fiber = self.bsdf.fiber
-        n = self.context.n[:, None]
-        variance_f = (n * self.guess.beta_f**2).mean(-1)
+        bent = refractions(fiber, self.diff, torch.full_like(self.diff, math.pi / 4))
+        energies = lobe_energies(bent, fiber.sigma_a, bsdf.convention.absorption)
+        theta_h = self.theta_h.unsqueeze(-1)
         for k, name in enumerate(("R", "TT", "TRT")):
-            mean, std = fiber.alpha[k].expand_as(self.low), fiber.beta[k].expand_as(self.low)
+            x, energy, beta = theta_h - fiber.alpha[k], energies[..., k, :], fiber.beta[k]
             if direct:
-                law = azimuth_tables(self.bsdf, False)[k]
-                found.append(self._component(name, k, mean, std, law, self.context.v, 0 * n))
+                part = self.v * energy * torch.exp(log_gauss(x, beta))
+                found.append(self._component(name, part, azimuth_tables(bsdf, False)[k]))
             if scattered:
-                law = azimuth_tables(self.bsdf, True)[k]
-                wide = torch.sqrt(std**2 + variance_f)
-                found.append(self._component(f"{name}_scattered", k, mean, wide, law, 1 - self.context.v, n))
-        if bool(self.bsdf.d_b > 0):
-            law = BackHalf() if self.bsdf.convention.back_azimuth == "back" else UniformAzimuth()
-            shift = self.guess.delta_b.mean(-1)
-            spread = torch.sqrt(self.guess.sigma_b.mean(-1) ** 2 + variance_f * (1 - self.context.v))
-            found.append(self._component("back", None, shift, spread, law, self.context.v, n))
+                part = (1 - self.v) * self.passed * energy
+                part = part * torch.exp(log_gauss(x, torch.sqrt(beta**2 + self.variance_f)))
+                found.append(self._component(f"{name}_scattered", part, azimuth_tables(bsdf, True)[k]))
+        if bool(bsdf.d_b > 0):
+            found.append(self._component("back", self._back(theta_h), self._back_azimuth()))
         return found
 
-    def _component(
-        self,
-        name: str,
-        k: int | None,
-        mean: Tensor,
-        std: Tensor,
-        law,
-        share: Tensor,
-        n: Tensor,  # noqa: ANN001
-    ) -> tuple[str, float, Proposal]:
-        """Reweight a lobe `N(mean, std)` by what multiplies it in the integrand, and match its moments."""
-        u = (torch.arange(_POINTS, dtype=torch.float64) + 0.5)[:, None] / _POINTS
-        theta_h = truncated_normal_icdf(u, mean, std, self.low, self.high)
-        mass = torch.special.ndtr((self.high - mean) / std) - torch.special.ndtr((self.low - mean) / std)
-        factor = self._factor(theta_h, k, share, n) * (mass / _POINTS).clamp_min(1e-12)
-        energy = factor.sum(0)
-        weight = factor / energy.clamp_min(1e-300)
-        moved = (weight * theta_h).sum(0) - theta_h.mean(0)
-        center = (weight * theta_h).sum(0)
-        spread = ((weight * (theta_h - center) ** 2).sum(0) / theta_h.var(0, correction=0).clamp_min(1e-12)).sqrt()
-        limit = 0.98 * MEAN_BOUNDS[1]
-        mode = (mean + moved).mean().clamp(-limit, limit)
-        width = (std * spread.clamp(0.3, 1.5)).mean().clamp(1e-4, 2.0)
-        return name, float(energy.mean()), Product(SplitGaussianLobe(mode, width, width), law)
+    def _back(self, theta_h: Tensor) -> Tensor:
+        average, x = self.average, theta_h - self.average.delta_b
+        near = self.v * torch.exp(log_gauss(x, average.sigma_b))
+        far = (1 - self.v) * self.passed * torch.exp(log_gauss(x, torch.sqrt(average.sigma_b**2 + self.variance_f)))
+        around = 4 if self.bsdf.convention.back_azimuth == "all" else 2
+        return around * self.bsdf.d_b * average.A_b * (near + far)
 
-    def _factor(self, theta_h: Tensor, k: int | None, share: Tensor, n: Tensor) -> Tensor:
-        """What multiplies the lobe: energy x cos^2(theta_i)/cos^2(theta_diff) x transmittance, norm over channels."""
-        bsdf, theta_r = self.bsdf, self.context.theta_r
-        theta_i = (2 * theta_h - theta_r).clamp(-HALF_PI, HALF_PI)
-        diff = (theta_r - theta_i) / 2
-        projection = cos_inclination(theta_i) ** 2 / cos_inclination(diff) ** 2
-        average = bsdf.averages(theta_i)
-        passed = torch.exp(n * torch.log(average.a_f.clamp_min(1e-300)))
-        if k is None:
-            v = self.context.v[:, None]
-            strength = average.A_b * (v + (1 - v) * passed * bsdf.d_f) * 2 * bsdf.d_b
-        else:
-            bent = refractions(bsdf.fiber, diff, torch.full_like(diff, math.pi / 4))
-            energies = lobe_energies(bent, bsdf.fiber.sigma_a, bsdf.convention.absorption)[..., k, :]
-            strength = share[:, None] * passed * energies
-        return torch.linalg.vector_norm(strength, dim=-1) * projection
+    def _back_azimuth(self) -> Azimuthal:
+        return BackHalf() if self.bsdf.convention.back_azimuth == "back" else UniformAzimuth()
+
+    def _component(self, name: str, part: Tensor, law: Azimuthal) -> tuple[str, float, Proposal]:
+        """A split Gaussian with the mean of the marginal, and the root mean squares on either side of it."""
+        projection = cos_inclination(self.theta_i) ** 2 / cos_inclination(self.diff) ** 2
+        mass = torch.linalg.vector_norm(part, dim=-1) * projection * self.weight
+        energy = mass.sum(-1, keepdim=True)
+        share = mass / energy.clamp_min(1e-300)
+        center = (share * self.theta_h).sum(-1, keepdim=True)
+        widths = []
+        for side in (self.theta_h < center, self.theta_h >= center):
+            half = torch.where(side, share, 0.0)
+            square = (half * (self.theta_h - center) ** 2).sum(-1) / half.sum(-1).clamp_min(1e-12)
+            widths.append(torch.sqrt(square).mean().clamp(1e-4, 2.0))
+        limit = 0.98 * MEAN_BOUNDS[1]
+        lobe = SplitGaussianLobe(center.mean().clamp(-limit, limit), *widths)
+        return name, float(energy.mean()), Product(lobe, law)

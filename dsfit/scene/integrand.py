@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from dsfit.bsdf.azimuthal import support_edges
+from dsfit.bsdf.breaks import theta_breaks
 from dsfit.bsdf.dual_scattering import DualScattering
 from dsfit.context import Context
 from dsfit.errors import InputError
 from dsfit.frame import HALF_PI, theta_diff, wrap
-from dsfit.quadrature import merge_breaks
 from dsfit.scene.lights import ConstantLight, Light
 from dsfit.scene.scattering import ConstantScattering, Scattering
 
@@ -25,12 +25,11 @@ class Integrand:
         light: incident radiance; left out, a furnace of radiance 1.
         scattering: (n, v) towards each direction; left out, the context's hints everywhere.
 
-    `integrand(omega_i, context)` takes directions `[*samples, *batch, 2]`. Channels of the BSDF and of the light must agree or be 1.
+    `integrand(omega_i, context)` takes directions `[*samples, *batch, 2]`. Channels of the BSDF and of the light must
+    agree or be 1.
     """
 
-    def __init__(
-        self, bsdf: DualScattering, light: Light | None = None, scattering: Scattering | None = None
-    ) -> None:
+    def __init__(self, bsdf: DualScattering, light: Light | None = None, scattering: Scattering | None = None) -> None:
         self.bsdf = bsdf
         self.light = ConstantLight() if light is None else light
         self.scattering = ConstantScattering() if scattering is None else scattering
@@ -61,33 +60,16 @@ class Integrand:
         return None if self.bsdf.fiber.is_round else context.phi_r - phi / 2
 
     def theta_breaks(self, context: Context) -> Tensor:
-        """Panel ends in theta_i for one context: lobe centres and flanks, jumps of the TRT lobe, peaks of the light."""
-        fiber, theta_r = self.bsdf.fiber, context.theta_r.detach()
-        alpha, beta = fiber.alpha.detach().to(theta_r), fiber.beta.detach().to(theta_r)
-        steps = torch.tensor([-8.0, -4.0, -2.0, 0.0, 2.0, 4.0, 8.0], dtype=theta_r.dtype)
-        points = [(2 * alpha[:, None] + 2 * beta[:, None] * steps - theta_r).flatten()]
-        if self.bsdf.convention.back_argument == "theta_diff+theta_r":
-            points.append(3 * theta_r.reshape(1))
-        average = self.bsdf.averages(-theta_r)
-        center = (2 * average.delta_b - theta_r).detach().flatten()
-        points += [center, center - 4 * average.sigma_b.detach().flatten(), center + 4 * average.sigma_b.detach().flatten()]
-        points += [theta_r + 2 * s * t for t in self._jumps() for s in (-1, 1)]
-        extra = [*self.light.breakpoints()[0], *self.scattering.breakpoints()[0], -1.2, -0.7, 0.0, 0.7, 1.2]
-        points.append(torch.tensor(extra, dtype=theta_r.dtype))
-        return merge_breaks(torch.cat([p.reshape(-1) for p in points]), -HALF_PI, HALF_PI, 1e-7)
+        """Panel ends in theta_i for one context: those of the BSDF, and the peaks of light and scattering."""
+        extra = [*self.light.breakpoints()[0], *self.scattering.breakpoints()[0]]
+        return theta_breaks(self.bsdf, context.theta_r, extra)
 
-    def _jumps(self) -> list[Tensor]:
-        """theta_diff at which eta' = sqrt 2, 2, or the end of the glint's fade, for a round fibre."""
-        fiber = self.bsdf.fiber
-        found = []
-        for target in (math.sqrt(2.0), 2.0, 2.0 + float(fiber.caustic_fade.detach())):
-            cos2 = (float(fiber.eta.detach()) ** 2 - 1) / (target * target - 1)
-            if 0 < cos2 < 1:
-                found.append(torch.acos(torch.tensor(math.sqrt(cos2), dtype=fiber.dtype)).reshape(1))
-        return found
+    def azimuth_edges(self, context: Context, theta_i: Tensor, *, coarse: bool = False) -> Tensor:
+        """Sorted relative azimuths `[..., J]` in [-pi, pi], ends included, where the integrand has edges, caustics or
+        light peaks.
 
-    def azimuth_edges(self, context: Context, theta_i: Tensor) -> Tensor:
-        """Sorted relative azimuths `[..., J]` in [-pi, pi], ends included, where the integrand has edges, caustics or light peaks."""
+        `coarse` leaves out the weak edges of N^G, which matter to the last digits only.
+        """
         diff = theta_diff(theta_i, context.theta_r)
         fiber = self.bsdf.fiber
         if fiber.is_round:
@@ -95,8 +77,10 @@ class Integrand:
         else:  # the edges move with phi_h: take those of both principal orientations
             both = [support_edges(fiber, diff, torch.full_like(diff, a)) for a in (0.0, HALF_PI)]
             edges = torch.cat(both, dim=-1)
-        points = [edges]
-        if self._scatters(context):
+        points = [] if coarse and not self._lit(context) else [edges]
+        if self._scatters(context) and coarse:
+            points.append(torch.full_like(diff, HALF_PI).unsqueeze(-1))
+        elif self._scatters(context):
             shifted = torch.cat([(edges - HALF_PI).abs(), math.pi - (edges - HALF_PI).abs()], dim=-1)
             points += [shifted, torch.full_like(diff, HALF_PI).unsqueeze(-1)]
         half = torch.cat(points, dim=-1)
@@ -106,6 +90,10 @@ class Integrand:
 
     def _light_azimuths(self) -> list[float]:
         return [*self.light.breakpoints()[1], *self.scattering.breakpoints()[1]]
+
+    def _lit(self, context: Context) -> bool:
+        constant = isinstance(self.scattering, ConstantScattering)
+        return not constant or self.bsdf.convention.share == "sum" or bool((context.v != 0).any())
 
     def _scatters(self, context: Context) -> bool:
         constant = isinstance(self.scattering, ConstantScattering)

@@ -1,0 +1,137 @@
+"""The command line: `dsfit run CONFIG`, `dsfit show RUNDIR`, `dsfit presets`.
+
+Exit codes: 0 done, 1 the run failed (what is done is kept), 2 the config or an argument is wrong (nothing was
+written), 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+if TYPE_CHECKING:
+    from dsfit.experiment.rundir import RunDirectory
+
+app = typer.Typer(
+    help="Monte Carlo rendering of hair that converges faster: run experiments from config files.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+@app.callback()
+def _group() -> None:
+    pass  # makes `run` a subcommand whatever else there is
+
+
+@app.command()
+def run(
+    config: Annotated[Path, typer.Argument(help="TOML file; configs/quickstart.toml is a good start.")],
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change one key, as in --set fiber.eta=1.6; may be repeated."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for run directories, instead of output.dir.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Compute anew what an earlier run left.")] = False,
+    workers: Annotated[
+        int | None, typer.Option(min=0, help="Processes; default: the number of cores. 0: none but this one.")
+    ] = None,
+) -> None:
+    """Run an experiment: compute, tabulate, plot. A finished run is shown again, an interrupted one goes on where it
+    stopped."""
+    from dsfit.errors import InputError
+    from dsfit.experiment import runner
+    from dsfit.experiment.progress import BarProgress
+    from dsfit.experiment.rundir import RunFailure
+    from dsfit.experiment.validation import load
+
+    try:
+        experiment = load(config, set_ or [])
+    except InputError as error:
+        _fail(f"config error\n{error}", 2)
+    directory = runner.run_directory(experiment, out)
+    try:
+        with BarProgress(experiment.name) as progress:
+            outcome = runner.run(experiment, out, force=force, workers=workers, progress=progress)
+        if outcome.skipped:
+            _console().print(f"already done; --force computes it anew: {directory.path}", soft_wrap=True)
+        _report(directory, outcome.result, draw=experiment.config.output.plots and not outcome.skipped)
+    except KeyboardInterrupt:
+        _fail(f"interrupted; the same command goes on from here: {directory.path}", 130)
+    except (RunFailure, InputError, OSError) as error:
+        _fail(f"run failed: {error}\nthe same command goes on from here: {directory.path}", 1)
+
+
+@app.command()
+def show(
+    rundir: Annotated[Path, typer.Argument(help="A run directory.")],
+    plots: Annotated[
+        bool, typer.Option("--plots/--no-plots", help="Draw the figures again from the stored data.")
+    ] = False,
+) -> None:
+    """Print a finished run's table again, and draw its figures again if asked to."""
+    from dsfit.errors import InputError
+    from dsfit.experiment.rundir import RunDirectory
+
+    try:
+        directory = RunDirectory(rundir)
+        _report(directory, directory.result(), draw=plots)
+    except (InputError, KeyError, TypeError, IndexError) as error:
+        text = (
+            str(error)
+            if isinstance(error, InputError)
+            else f"{rundir}: damaged result ({type(error).__name__}: {error})"
+        )
+        _fail(text, 2)
+
+
+@app.command()
+def presets() -> None:
+    """List the fibre presets."""
+    from dsfit.bsdf import Fiber
+
+    for name in Fiber.presets():
+        sigma = ", ".join(f"{value:g}" for value in Fiber.preset(name).sigma_a.tolist())
+        _console().print(f"{name:<14} sigma_a = [{sigma}] per fibre radius")
+
+
+def _console() -> Console:
+    """Standard output; as wide as the table needs where it is not a terminal."""
+    return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=170)
+
+
+def _report(directory: RunDirectory, result: dict[str, Any], draw: bool) -> None:
+    from dsfit.experiment import files, summary
+
+    console = _console()
+    console.print(summary.terminal_table(result))
+    files.write_bytes(directory.path / "table.md", summary.markdown(result).encode())
+    figures = directory.path / "figures"
+    if draw:
+        from dsfit.experiment import plots
+
+        plots.draw_all(directory, result)
+    console.print(f"results:   {directory.path / 'result.json'}", soft_wrap=True)
+    if (fitted := directory.path / "proposals").is_dir():
+        console.print(f"proposals: {fitted} (dsfit.load_proposal)", soft_wrap=True)
+    if figures.is_dir():
+        console.print(f"figures:   {figures}", soft_wrap=True)
+
+
+def _fail(message: str, code: int) -> None:
+    typer.echo(f"dsfit: {message}", err=True)
+    raise typer.Exit(code)
+
+
+def main() -> None:
+    """Entry point of the `dsfit` command."""
+    app()
+
+
+if __name__ == "__main__":
+    main()
