@@ -17,7 +17,8 @@ from dsfit.bsdf.snell import Refraction
 from dsfit.frame import HALF_PI
 from dsfit.quadrature import PiecewiseChebyshev, graded_ends, merge_breaks, panel_points
 
-_ECCENTRIC_NODES = 24
+_ORIENTATION_NODES = 12
+_JUMPS = (math.sqrt(2.0), 2.0)  # eta' at which the way of TRT changes
 
 
 @dataclass(frozen=True)
@@ -76,41 +77,47 @@ class LobeShares:
         return value.select(-3, 0), value.select(-3, 1)
 
     def _jumps(self) -> Tensor:
-        """theta_diff where eta' = 2 or eta' = sqrt 2 for some orientation: the TRT share has a jump in its second
-        derivative there.
+        """theta_diff where eta' = 2 or eta' = sqrt 2 for a principal orientation of the section.
+
+        The TRT share has a jump in its second derivative there, or, for an eccentric section, its average over
+        orientations begins to see one.
         """
-        fiber = self.fiber
-        etas = [fiber.eta] if fiber.is_round else [fiber.eta_trt(angle) for angle in self._orientations()]
         points = []
-        for eta in etas:
-            for target in (2.0, math.sqrt(2.0)):
-                cos2 = (eta.detach() ** 2 - 1) / (target * target - 1)
+        for angle in (0.0, math.pi / 2):
+            eta = self.fiber.eta_trt(torch.tensor(angle, dtype=self.fiber.dtype)).detach()
+            for target in _JUMPS:
+                cos2 = (eta**2 - 1) / (target * target - 1)
                 if 0.0 < float(cos2) < 1.0:
                     points.append(torch.acos(torch.sqrt(cos2)).reshape(()))
-        return torch.stack(points) if points else torch.zeros(0, dtype=fiber.dtype)
-
-    def _orientations(self) -> Tensor:
-        """phi_h over one period; the average over them is that of a periodic analytic function, for which the
-        trapezium rule is exact.
-        """
-        return torch.arange(_ECCENTRIC_NODES, dtype=self.fiber.dtype) * (math.pi / _ECCENTRIC_NODES)
+        return torch.stack(points) if points else torch.zeros(0, dtype=self.fiber.dtype)
 
     def _energies_at(self, theta_diff: Tensor) -> Tensor:
         fiber = self.fiber
         plain = Refraction.at(fiber.eta, theta_diff)
-        if fiber.is_round:
-            return self._split((plain, plain, plain)).flatten(1)
-        total: Tensor | float = 0.0
-        for angle in self._orientations():
-            bent = Refraction.at(fiber.eta_trt(angle), theta_diff)
-            total = total + self._split((plain, plain, bent))
-        return (total / _ECCENTRIC_NODES).flatten(1)
+        energies = self._split((plain, plain, plain))
+        if not fiber.is_round:
+            phi_h, weight = self._orientations(theta_diff)
+            bent = Refraction.at(fiber.eta_trt(phi_h), theta_diff[:, None])
+            turned = (self._split((bent, bent, bent))[..., 2:, :] * weight[..., None, None, None]).sum(1)
+            energies = torch.cat([energies[..., :2, :], turned], dim=-2)
+        return energies.flatten(1)
+
+    def _orientations(self, theta_diff: Tensor) -> tuple[Tensor, Tensor]:
+        """phi_h and weights `[M, nodes]` of the average over orientations, split where eta' crosses 2 and sqrt 2."""
+        low, high = (self.fiber.eta_trt(torch.tensor(a, dtype=theta_diff.dtype)).detach() for a in (math.pi / 2, 0.0))
+        sin2, cos2 = torch.sin(theta_diff) ** 2, torch.cos(theta_diff) ** 2
+        cuts = [torch.zeros_like(sin2), torch.full_like(sin2, math.pi / 2)]
+        for target in _JUMPS:
+            cosine = (2 * torch.sqrt(sin2 + target**2 * cos2) - high - low) / (high - low)
+            cuts.append(torch.acos(cosine.clamp(-1.0, 1.0)) / 2)
+        nodes, weight = panel_points(torch.sort(torch.stack(cuts, dim=-1), dim=-1).values, _ORIENTATION_NODES)
+        return nodes, weight * (2 / math.pi)
 
     def _of_lobe(self, columns: Tensor, p: int) -> Tensor:
         return columns.unflatten(-1, (2, 3, self.fiber.channels))[..., p, :].flatten(-2)
 
     def _split(self, bent: tuple[Refraction, ...]) -> Tensor:
-        """Forward and backward azimuthal energy, `[M, 2, 3, C]`."""
+        """Forward and backward azimuthal energy, `[..., 2, 3, C]`."""
         fiber, absorption = self.fiber, self.convention.absorption
         if self.convention.split == "fraction":
             front, back = forward_backward_energies(bent, fiber.sigma_a, absorption)
@@ -119,7 +126,7 @@ class LobeShares:
             phi = torch.full_like(bent[0].kappa, math.pi)
             front = offset_windows(fiber, bent, phi, "raw", absorption)
             back = total - front
-        return torch.stack([front, back], dim=1)
+        return torch.stack([front, back], dim=-3)
 
     def _share_breaks(self) -> Tensor:
         """Break points in theta_in: where a lobe leaves the reachable set, where it meets the kink at eta' = 2, and

@@ -1,7 +1,7 @@
 """Writes reference_values.json beside this file: the oracle at many points of seven fibres. Deterministic.
 
-    python tests/oracle/make_reference_values.py             # about a minute on one core
-    python tests/oracle/make_reference_values.py --verify    # compares every stored value with another method
+    python tests/oracle/make_reference_values.py       # about two minutes on one core
+    python tests/oracle/verify_reference_values.py     # compares every stored value with another method
 
 Inputs are float32 numbers (stored exactly), so that a float32 implementation sees the same points. Random points keep
 at least 1e-4 rad (`margin`) from the caustics and support edges of the raw lobes, where N_p is singular or zero, and
@@ -12,21 +12,19 @@ at least 1e-4 rad (`margin`) from the caustics and support edges of the raw lobe
     mean                   E_p / (2 pi), the size of N_p and N^G_p (marschner: that of raw)
     averages               at theta_in = theta_i, consistent;  averages_printed at theta_in = theta_diff
     consistent             {model: F cos(theta_i)}
-    peak                   F cos(theta_i), marschner, with all longitudinal Gaussians at their maximum
     printed                {model: f of eqs (4)-(12)} for marschner and simplified
-`switches` lists averages under single changed switches of the convention.
+    size, size_printed     {model: the sum of |terms| with all longitudinal Gaussians at their maximum}
+`switches` lists averages and F (marschner and simplified) with one switch of `consistent` changed at a time.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import sys
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
-import mpmath
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -34,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import oracle_azimuth as oz  # noqa: E402
 import oracle_bsdf as ob  # noqa: E402
 import oracle_scattered as og  # noqa: E402
-from oracle_averages import Averages, Options, averages  # noqa: E402
+from oracle_averages import Averages, averages  # noqa: E402
 from oracle_azimuth import Fiber  # noqa: E402
 
 RAD = math.radians
@@ -74,15 +72,20 @@ STRUCTURED = [
     (0.9, -0.9, 0.0, 3.0, 0.0),
 ]
 
-SWITCHES = {
-    "outgoing": Options(cosine="outgoing"),
-    "half": Options(split="half"),
-    "mean": Options(width="mean"),
-    "absorption": Options(absorption="printed"),
-    "plus": Options(delta_sign=1.0),
-    "energy": Options(c_m=1.0),
-    "printed": ob.PRINTED,
-}
+SWITCHES = [
+    {name: value}
+    for name, value in asdict(ob.PRINTED_SLIPS).items()
+    if value != getattr(ob.Slips(), name) and name != "simplified_energy"
+] + [
+    {"simplified_energy": "printed"},
+    {"back_azimuth": "back"},
+    {"shift_sign": "plus"},
+    {"absorption": "printed2003"},
+    {"split": "half"},
+    {"mean_width": "width"},
+    {"average_weight": "outgoing"},
+]
+SWITCH_POINTS = [(-0.7, 0.55, 2.6, 3.0, 0.25), (0.2, 0.1, 0.5, 1.0, 0.5), (1.3, -1.0, -1.9, 6.0, 0.0)]
 
 
 def as_float32(x: float) -> float:
@@ -129,6 +132,11 @@ def points(fiber: Fiber, seed: int) -> list[dict[str, float]]:
     return chosen
 
 
+def parameters(fiber: Fiber) -> dict:
+    """The fields of dsfit.Fiber."""
+    return {name: value for name, value in asdict(fiber).items() if name != "absorption"}
+
+
 def fields(a: Averages) -> dict[str, np.ndarray]:
     return {name: getattr(a, name) for name in Averages.FIELDS}
 
@@ -144,137 +152,63 @@ def evaluate(fiber: Fiber, point: dict[str, float], order: int = 16) -> dict:
         "averages": fields(averages(fiber, g.theta_i, order=order)),
         "averages_printed": fields(averages(fiber, t, options=ob.PRINTED, order=order)),
         "consistent": {m: ob.consistent(fiber, g, n, v, m, order=order) for m in oz.MODELS},
-        "peak": ob.peak(fiber, g, n, v),
+        "size": {m: ob.general(fiber, g, n, v, m, order=order)[1] for m in oz.MODELS},
         "printed": {m: ob.printed(fiber, g, n, m, order=order) for m in ("marschner", "simplified")},
+        "size_printed": {
+            m: ob.general(fiber, g, n, v, m, slips=ob.PRINTED_SLIPS, order=order)[1]
+            for m in ("marschner", "simplified")
+        },
     }
 
 
 def switches(order: int = 16) -> list[dict]:
     rows = []
-    for name in ("blond", "brown", "dense"):
-        for theta_in in map(as_float32, (-0.7, 0.2, 1.3)):
-            for switch, options in SWITCHES.items():
-                a = averages(FIBERS[name], theta_in, options=options, order=order)
-                rows.append({"fiber": name, "theta_in": theta_in, "switch": switch, "averages": fields(a)})
+    for name in ("blond", "dense"):
+        for raw in SWITCH_POINTS:
+            theta_i, theta_r, phi, n, v = map(as_float32, raw)
+            g = ob.Geometry(theta_i, theta_r, phi)
+            for switch in SWITCHES:
+                slips = ob.Slips(**switch)
+                row = {
+                    "fiber": name,
+                    "theta_i": theta_i,
+                    "theta_r": theta_r,
+                    "phi": phi,
+                    "n": n,
+                    "v": v,
+                    "switch": switch,
+                }
+                row["averages"] = fields(
+                    averages(slips.fiber(FIBERS[name]), theta_i, options=slips.options(), order=order)
+                )
+                for model in ("marschner", "simplified"):
+                    row[model], row[model + "_size"] = ob.general(
+                        FIBERS[name], g, n, v, model, slips=slips, order=order
+                    )
+                rows.append(row)
     return rows
 
 
-def plain(x):
-    """JSON-ready copy; floats rounded to 16 significant digits (relative error below 5e-16)."""
+def plain(x, digits: int = DIGITS):
+    """JSON-ready copy; floats rounded to 16 significant digits (relative error below 5e-16), sizes to 3."""
     if isinstance(x, dict):
-        return {key: plain(value) for key, value in x.items()}
+        return {key: plain(value, 3 if "size" in key or key == "mean" else digits) for key, value in x.items()}
     if isinstance(x, (list, tuple)):
-        return [plain(value) for value in x]
+        return [plain(value, digits) for value in x]
     if isinstance(x, np.ndarray):
-        return plain(x.tolist())
-    return float(f"{x:.{DIGITS}g}") if isinstance(x, float) else x
-
-
-# --------------------------------------------------------------------------------------------------------- verification
-
-
-def azimuthal_30_digits(fiber: Fiber, p: int, theta_diff: float, phi: float, model: str, phi_h: float) -> list[float]:
-    """N_p (marschner, raw) in 30-digit arithmetic; the oracle gives only the number and rough place of the roots."""
-    mp = mpmath
-    with mp.workdps(30):
-        eta, t = mp.mpf(fiber.eta), mp.mpf(theta_diff)
-        if p == 2:
-            a2 = mp.mpf(fiber.eccentricity) ** 2
-            one, two = 2 * (eta - 1) * a2 - eta + 2, 2 * (eta - 1) / a2 - eta + 2
-            eta = (one + two + mp.cos(2 * mp.mpf(phi_h)) * (one - two)) / 2
-        e1 = mp.sqrt(eta**2 - mp.sin(t) ** 2) / mp.cos(t)
-
-        def azimuth(gi):
-            return 2 * p * mp.asin(mp.sin(gi) / e1) - 2 * gi + p * mp.pi
-
-        def path(gi, sigma):
-            c = mp.cos(t) * mp.cos(gi)
-            c_t = mp.sqrt(1 - (1 - c * c) / eta**2)
-            f = (((c - eta * c_t) / (c + eta * c_t)) ** 2 + ((eta * c - c_t) / (eta * c + c_t)) ** 2) / 2
-            length = 2 * p * mp.sqrt(1 - (mp.sin(gi) / e1) ** 2) / mp.sqrt(1 - (mp.sin(t) / eta) ** 2)
-            return f if p == 0 else (1 - f) ** 2 * f ** (p - 1) * mp.exp(-sigma * length)
-
-        def gap(x):
-            return x - 2 * mp.pi * mp.nint(x / (2 * mp.pi))
-
-        totals = []
-        for sigma in map(mp.mpf, fiber.sigma_a):
-            total = mp.mpf(0)
-            for start in oz.roots(p, phi, oz.bravais(oz.lobe_eta(fiber, p, phi_h), theta_diff)[0]):
-                if abs(abs(start) - oz.HALF_PI) < 1e-9:
-                    continue
-                gi = mp.findroot(lambda x: gap(azimuth(x) - phi), mp.mpf(start))
-                slope = 2 * p * mp.cos(gi) / mp.sqrt(e1**2 - mp.sin(gi) ** 2) - 2
-                total += path(gi, sigma) * mp.cos(gi) / abs(slope) / 2
-            if p == 2 and model == "marschner":
-                w = mp.mpf(fiber.caustic_width)
-                if e1 < 2:
-                    h = mp.sqrt((4 - e1**2) / 3)
-                    curve = mp.diff(lambda x: azimuth(mp.asin(x)), h, 2)
-                    offset = min(mp.mpf(fiber.caustic_max_offset), 2 * mp.sqrt(2 * w / abs(curve)))
-                    keep = mp.mpf(1)
-                else:
-                    h, offset = mp.mpf(0), mp.mpf(fiber.caustic_max_offset)
-                    s = min((e1 - 2) / mp.mpf(fiber.caustic_fade), mp.mpf(1))
-                    keep = 1 - s * s * (3 - 2 * s)
-                centre = gap(azimuth(mp.asin(h))) if e1 < 2 else mp.mpf(0)
-                height = keep * mp.mpf(fiber.glint_scale) * path(mp.asin(h), sigma) * offset
-                for c in (centre, -centre):
-                    total *= 1 - keep * mp.exp(-(gap(phi - c) ** 2) / (2 * w * w))
-                for c in (centre, -centre):
-                    total += height * mp.npdf(gap(phi - c), 0, w)
-            totals.append(float(total))
-        return totals
-
-
-def deviation(x: np.ndarray, y: np.ndarray, floor: np.ndarray | float = 0.0) -> float:
-    size = np.maximum(np.abs(y), floor)
-    return float(np.max(np.where(size > 0.0, np.abs(x - y) / np.where(size > 0.0, size, 1.0), np.abs(x - y))))
-
-
-def verify(data: dict) -> None:
-    """Prints the largest relative deviations from other methods (N and N^G: relative to max(value, 1e-3 mean))."""
-    for name, fiber in FIBERS.items():
-        worst = dict.fromkeys(
-            ("azimuthal", "scattered", "scattered_raw", "averages", "averages_printed", "consistent", "printed"), 0.0
-        )
-        for point in data["fibers"][name]["points"]:
-            t, phi, phi_h = point["theta_diff"], point["phi"], point["phi_h"]
-            floor = 1e-3 * np.array(point["mean"])
-            for model in ("marschner", "raw"):
-                for p in range(3):
-                    other = np.array(azimuthal_30_digits(fiber, p, t, phi, model, phi_h))
-                    worst["azimuthal"] = max(
-                        worst["azimuthal"], deviation(np.array(point["azimuthal"][model][p]), other, floor[p])
-                    )
-                    method = og.scattered_by_azimuth if model == "raw" else og.scattered_by_offset
-                    other = method(fiber, p, t, phi, model, phi_h)
-                    key = "scattered_raw" if model == "raw" else "scattered"
-                    worst[key] = max(worst[key], deviation(np.array(point["scattered"][model][p]), other, floor[p]))
-            finer = evaluate(fiber, point, order=20)
-            for key in ("averages", "averages_printed", "consistent", "printed"):
-                for inner, value in finer[key].items():
-                    angle = inner in ("alpha_f", "alpha_b", "delta_b")
-                    size = max(np.abs(value).max(), abs(fiber.alpha[0])) if angle else 0.0
-                    worst[key] = max(worst[key], deviation(np.array(point[key][inner]), value, size))
-        print(name, {key: f"{value:.1e}" for key, value in worst.items()}, flush=True)
+        return plain(x.tolist(), digits)
+    return float(f"{x:.{digits}g}") if isinstance(x, float) else x
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--verify", action="store_true", help="check the stored values by other methods; writes nothing"
-    )
-    if parser.parse_args().verify:
-        verify(json.loads(OUTPUT.read_text()))
-        return
     data: dict = {"d_f": 0.7, "d_b": 0.7, "fibers": {}}
     for seed, (name, fiber) in enumerate(FIBERS.items()):
         rows = [{**point, **evaluate(fiber, point)} for point in points(fiber, seed)]
-        data["fibers"][name] = {"parameters": asdict(replace(fiber)), "points": rows}
+        data["fibers"][name] = {"parameters": parameters(fiber), "points": rows}
         print(f"{name}: {len(rows)} points", flush=True)
     data["switches"] = switches()
-    OUTPUT.write_text(json.dumps(plain(data), separators=(",", ":")).replace('{"theta_i"', '\n{"theta_i"') + "\n")
+    text = json.dumps(plain(data), separators=(",", ":"))
+    OUTPUT.write_text(text.replace('{"theta_i"', '\n{"theta_i"').replace('{"fiber"', '\n{"fiber"') + "\n")
 
 
 if __name__ == "__main__":

@@ -29,7 +29,6 @@ class Options:
     cosine: str = "incident"  # weight cos(theta_in) (Zinke literal) or "outgoing" cos(theta_o) (albedo)
     split: str = "linear"  # front share |Phi|/pi, or "half": |Phi| > pi/2
     width: str = "variance"  # average beta^2, or "mean": average beta
-    absorption: str = "geometric"  # or "printed": the doubled depth of the 2003 paper
     delta_sign: float = -1.0  # sign in alpha_b (1 -+ 2 q^2)
     rescale: bool = True  # divide the pair by max(1, a_f + a_b)
 
@@ -106,7 +105,7 @@ def azimuthal_moments(
         nodes[row], weights[row] = _four_panels(ends, order)
     eta1 = np.sqrt(eta * eta - np.sin(theta_diff) ** 2) / np.cos(theta_diff)
     share = front_share(p, nodes, eta1[:, None], options.split)
-    a = attenuation(fiber, p, theta_diff[:, None], nodes, eta, options.absorption)
+    a = attenuation(fiber, p, theta_diff[:, None], nodes, eta)
     measure = (weights * np.cos(nodes))[..., None]
     return (a * measure * share[..., None]).sum(1), (a * measure * (1.0 - share)[..., None]).sum(1)
 

@@ -38,6 +38,7 @@ class Fiber:
     caustic_fade: float = 0.3
     caustic_max_offset: float = 0.5
     gamma_tt: float = math.radians(30.0)
+    absorption: str = "geometric"  # or "printed": the doubled depth of the 2003 paper; a switch of dsfit.Convention
 
 
 def wrap(x: float) -> float:
@@ -79,11 +80,11 @@ def transmission(eta: float, cos_in: np.ndarray | float) -> np.ndarray | float:
     return 0.5 * (t_s + t_p)
 
 
-def attenuation(fiber: Fiber, p: int, theta_diff, gi, eta: float, absorption: str = "geometric") -> np.ndarray:
+def attenuation(fiber: Fiber, p: int, theta_diff, gi, eta: float) -> np.ndarray:
     """A(p, h = sin gi): Fresnel factors and absorption of the path with p internal segments, [..., C].
 
-    theta_diff and gi may be numpy arrays that broadcast. absorption "geometric": T = exp(-2 sigma' cos gt) per segment;
-    "printed": exp(-2 sigma' (1 + cos 2 gt)) of the 2003 paper.
+    theta_diff and gi may be numpy arrays that broadcast. fiber.absorption "geometric": T = exp(-2 sigma' cos gt) per
+    segment; "printed": exp(-2 sigma' (1 + cos 2 gt)) of the 2003 paper.
     """
     theta_diff, gi = np.asarray(theta_diff, float), np.asarray(gi, float)
     cos_3d = np.cos(theta_diff) * np.cos(gi)
@@ -95,12 +96,12 @@ def attenuation(fiber: Fiber, p: int, theta_diff, gi, eta: float, absorption: st
     sin_gt = np.sin(gi) / eta1
     cos_gt = np.sqrt(1.0 - sin_gt * sin_gt)
     cos_theta_t = np.sqrt(1.0 - (np.sin(theta_diff) / eta) ** 2)
-    if absorption == "geometric":
+    if fiber.absorption == "geometric":
         length = 2.0 * cos_gt
-    elif absorption == "printed":
+    elif fiber.absorption == "printed":
         length = 4.0 * cos_gt * cos_gt
     else:
-        raise ValueError(absorption)
+        raise ValueError(fiber.absorption)
     depth = (p * length / cos_theta_t)[..., None] * sigma
     return (transmission(eta, cos_3d) ** 2 * reflect ** (p - 1))[..., None] * np.exp(-depth)
 
@@ -236,11 +237,11 @@ def trt_glint(fiber: Fiber, c: Caustic, phi: float) -> np.ndarray:
 
 
 @lru_cache(maxsize=4096)
-def energy(fiber: Fiber, p: int, theta_diff: float, eta: float, absorption: str = "geometric") -> tuple[float, ...]:
+def energy(fiber: Fiber, p: int, theta_diff: float, eta: float) -> tuple[float, ...]:
     """E_p = (1/2) int_{-1}^{1} A(p, h) dh = int N_p dphi, by adaptive quadrature in gi, per channel."""
 
     def integrand(gi: float, channel: int) -> float:
-        return float(attenuation(fiber, p, theta_diff, gi, eta, absorption)[channel]) * math.cos(gi)
+        return float(attenuation(fiber, p, theta_diff, gi, eta)[channel]) * math.cos(gi)
 
     return tuple(
         quad(integrand, 0.0, HALF_PI, args=(c,), epsabs=0.0, epsrel=1e-13, limit=200)[0]

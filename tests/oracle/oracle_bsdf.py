@@ -130,27 +130,105 @@ def printed(
     return (direct + scatter) * math.cos(g.theta_i)
 
 
-def peak(
-    fiber: Fiber, g: Geometry, n: float, v: float, model: str = "marschner", d_f: float = 0.7, d_b: float = 0.7
-) -> np.ndarray:
-    """`consistent` with every longitudinal Gaussian at its maximum: the size against which tails are compared, [C]."""
-    a = averages(fiber, g.theta_i, d_b)
+@dataclass(frozen=True)
+class Slips:
+    """Single switches between the two conventions, named and valued as the fields of dsfit.Convention."""
+
+    lobe_norm: str = "energy"
+    inverse_cos2: bool = True
+    share: str = "complement"
+    density_power: int = 1
+    back_factor: str = "derived"
+    scattered_azimuth: str = "convolution"
+    back_argument: str = "theta_h"
+    back_width: str = "scatter"
+    back_azimuth: str = "all"
+    shift_sign: str = "minus"
+    absorption: str = "geometric"
+    split: str = "fraction"
+    mean_width: str = "variance"
+    average_weight: str = "incident"
+    average_angle: str = "theta_in"
+    limit_energy: bool = True
+    simplified_energy: str = "attenuation"
+
+    def options(self) -> Options:
+        """What of this concerns the averages."""
+        return Options(
+            c_m=0.5 if self.lobe_norm == "energy" else 1.0,
+            cosine=self.average_weight,
+            split="linear" if self.split == "fraction" else "half",
+            width="variance" if self.mean_width == "variance" else "mean",
+            delta_sign=-1.0 if self.shift_sign == "minus" else 1.0,
+            rescale=self.limit_energy,
+        )
+
+    def fiber(self, fiber: Fiber) -> Fiber:
+        return replace(fiber, absorption="geometric" if self.absorption == "geometric" else "printed")
+
+
+PRINTED_SLIPS = Slips(
+    lobe_norm="printed",
+    inverse_cos2=False,
+    share="sum",
+    density_power=2,
+    back_factor="pi",
+    scattered_azimuth="constant",
+    back_argument="theta_diff+theta_r",
+    back_width="always",
+    average_angle="theta_diff",
+    limit_energy=False,
+    simplified_energy="printed",
+)
+
+
+def general(
+    fiber: Fiber,
+    g: Geometry,
+    n: float,
+    v: float,
+    model: str = "marschner",
+    d_f: float = 0.7,
+    d_b: float = 0.7,
+    slips: Slips | None = None,
+    order: int = 16,
+) -> tuple[np.ndarray, np.ndarray]:
+    """(F cos(theta_i), its size), each [C], for any switches; size: sum of |terms|, Gaussians at their maximum."""
+    slips = slips or Slips()
+    fiber, options = slips.fiber(fiber), slips.options()
+    a = averages(fiber, g.theta_i if slips.average_angle == "theta_in" else g.theta_diff, d_b, options, order)
     sigma_f2 = n * a.beta_f**2
-    height = np.zeros(len(fiber.sigma_a))
+    single_factor = options.c_m / (math.cos(g.theta_diff) ** 2 if slips.inverse_cos2 else 1.0)
+    back_factor = 2.0 * single_factor / (math.pi if slips.inverse_cos2 else 1.0)
+    unit = model == "simplified" and slips.simplified_energy == "printed"
+    argument = g.theta_h if slips.back_argument == "theta_h" else g.theta_diff + g.theta_r
+    if slips.back_azimuth == "back" and abs(wrap(g.phi)) > HALF_PI:
+        back_factor = 0.0
+    lit, shaded = (1.0, 1.0) if slips.share == "sum" else (v, 1.0 - v)
+    shaded = shaded * a.a_f**n * d_f**slips.density_power
+    phi = g.phi if slips.scattered_azimuth == "convolution" else 0.0
+    extra_lit = sigma_f2 if slips.back_width == "always" else 0.0 * sigma_f2
+    pi_back = math.pi if slips.back_factor == "pi" else 1.0
+
+    def gauss(x: np.ndarray | float, variance: np.ndarray | float) -> np.ndarray:
+        """Value and maximum of a Gaussian, [2, C]."""
+        x, variance = np.broadcast_arrays(np.asarray(x) + 0.0 * a.a_f, np.asarray(variance) + 0.0 * a.a_f)
+        height = 1.0 / np.sqrt(2.0 * math.pi * variance)
+        return np.array([np.exp(-0.5 * x * x / variance) * height, height])
+
+    total = np.zeros((2, len(fiber.sigma_a)))
     for p in range(3):
-        near = gaussian(0.0, fiber.beta[p]) * azimuthal(fiber, p, g.theta_diff, g.phi, model, g.phi_h)
-        far = 0.0
-        if v < 1.0:
-            far = scattered(fiber, p, g.theta_diff, g.phi, model, g.phi_h) / np.sqrt(
-                2 * math.pi * (fiber.beta[p] ** 2 + sigma_f2)
-            )
-        height = height + v * near + (1 - v) * a.a_f**n * d_f * far
-    lobe_near, lobe_far = a.sigma_b, np.sqrt(a.sigma_b**2 + sigma_f2)
-    height = height + 2 * a.A_b * d_b / math.pi / math.sqrt(2 * math.pi) * (
-        v / lobe_near + (1 - v) * a.a_f**n * d_f / lobe_far
-    )
-    return 0.5 * height / math.cos(g.theta_diff) ** 2 * math.cos(g.theta_i)
-
-
-def with_channels(fiber: Fiber, sigma_a: tuple[float, ...]) -> Fiber:
-    return replace(fiber, sigma_a=tuple(sigma_a))
+        offset, variance = g.theta_h - fiber.alpha[p], fiber.beta[p] ** 2
+        total += (
+            lit
+            * single_factor
+            * gauss(offset, variance)
+            * azimuthal(fiber, p, g.theta_diff, g.phi, model, g.phi_h, unit)
+        )
+        if np.any(shaded != 0.0):
+            spread = scattered(fiber, p, g.theta_diff, phi, model, g.phi_h, unit)
+            total += shaded * single_factor * gauss(offset, variance + sigma_f2) * spread
+    height = np.array([a.A_b, np.abs(a.A_b)]) * d_b * back_factor
+    total += lit * height * gauss(argument - a.delta_b, a.sigma_b**2 + extra_lit)
+    total += shaded * pi_back * height * gauss(argument - a.delta_b, a.sigma_b**2 + sigma_f2)
+    return total[0] * math.cos(g.theta_i), total[1] * math.cos(g.theta_i)

@@ -110,7 +110,7 @@ def test_energy_table(theta, table):
 def test_absorbed_energies():
     brown = Fiber((0.432,))
     close(oz.energy(brown, 1, 0.0, 1.55)[0], 0.386, 3)
-    close(oz.energy(brown, 1, 0.0, 1.55, "printed")[0], 0.195, 3)
+    close(oz.energy(replace(brown, absorption="printed"), 1, 0.0, 1.55)[0], 0.195, 3)
     close(oz.energy(GREY, 1, 0.0, 1.55)[0], 0.7152662947, 10)  # FORMULAS H
     close(oz.energy(GREY, 1, RAD(60), 1.55)[0], 0.5506922157, 10)
 
