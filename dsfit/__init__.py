@@ -22,14 +22,14 @@ _PUBLIC = {
     "InputError": "dsfit.errors",
     "Integrand": "dsfit.scene",
     "Material": "dsfit.material",
-    "Nodes": "dsfit.reference",
+    "Nodes": "dsfit.quality",
     "StructuredProposal": "dsfit.proposals",
     "estimate": "dsfit.mis",
-    "excess": "dsfit.reference",
+    "excess": "dsfit.quality",
     "fit": "dsfit.fit",
     "load_proposal": "dsfit.experiment",
-    "quadrature_nodes": "dsfit.reference",
-    "reference": "dsfit.reference",
+    "quadrature_nodes": "dsfit.quality",
+    "reference": "dsfit.quality",
     "save_proposal": "dsfit.experiment",
 }
 

@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+_RESOLVED = 1e-8  # relative tail below which a panel counts as resolved
+
 
 @functools.lru_cache(maxsize=64)
 def _legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -73,9 +75,9 @@ class PiecewiseChebyshev:
             largest = max(largest, float(scale.max()))
             scale = scale.clamp_min(max(1e-3 * largest, torch.finfo(values.dtype).tiny))
             error = (tail / scale[:, None]).amax(-1)
-            # halving should cut the tail by far more than 4; where it does not, rounding (or an end point) is all
-            # that is left
-            bad = (error > tolerance) & (error < 0.25 * parent) & (depth < max_depth)
+            # once resolved, halving cuts the tail by far more than 4; where it does not, rounding is all that is left
+            improving = (error > _RESOLVED) | (error < 0.25 * parent)
+            bad = (error > tolerance) & improving & (depth < max_depth)
             done.append((low[~bad], high[~bad], coefficients[~bad]))
             if not bool(bad.any()):
                 break

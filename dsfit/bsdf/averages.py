@@ -67,7 +67,7 @@ class LobeShares:
         breaks = merge_breaks(torch.cat([self._kinks, inner]), 0.0, HALF_PI, 1e-12)
         energies = PiecewiseChebyshev(self._energies_at, breaks, tolerance=1e-12)
         self._energies = [energies.select(lambda c, p=p: self._of_lobe(c, p)) for p in range(3)]
-        self._shares = PiecewiseChebyshev(self._scaled_shares_at, self._share_breaks(), tolerance=1e-11)
+        self._shares = PiecewiseChebyshev(self._scaled_shares_at, self._share_breaks(), tolerance=1e-11, max_depth=8)
 
     def __call__(self, theta_in: Tensor) -> tuple[Tensor, Tensor]:
         """a_f^p and a_b^p, each `[..., 3, C]`."""

@@ -5,10 +5,13 @@ from dsfit.proposals.azimuth import CosineHalf, Scattered, TruncatedGaussian, Wr
 from dsfit.proposals.base import Azimuthal, Distribution, Longitudinal, Product, Proposal
 from dsfit.proposals.cauchy_lobe import CauchyLobe
 from dsfit.proposals.chapter import FrozenAverages, chapter_proposals
+from dsfit.proposals.conditional import FiberAzimuth, lobe_azimuths
 from dsfit.proposals.gaussian_lobe import BoxMullerLobe, GaussianLobe
 from dsfit.proposals.lobe import Lobe
 from dsfit.proposals.mixture import Mixture, MixtureDistribution
 from dsfit.proposals.scattered_lobe import BackScatterLobe, ScatteredLobe
+from dsfit.proposals.split_lobe import SplitGaussianLobe
+from dsfit.proposals.structured import StructuredProposal
 from dsfit.proposals.transmittance import TransmittanceCosine, TransmittanceGaussian
 from dsfit.proposals.uniform import (
     BackHalf,
@@ -26,6 +29,7 @@ __all__ = [
     "BoxMullerLobe",
     "CauchyLobe",
     "CosineHalf",
+    "FiberAzimuth",
     "Distribution",
     "FromDensity",
     "FrontHalf",
@@ -40,6 +44,8 @@ __all__ = [
     "Proposal",
     "Scattered",
     "ScatteredLobe",
+    "SplitGaussianLobe",
+    "StructuredProposal",
     "TorchDistribution",
     "TransmittanceCosine",
     "TransmittanceGaussian",
@@ -49,4 +55,5 @@ __all__ = [
     "UniformSphere",
     "WrappedGaussian",
     "chapter_proposals",
+    "lobe_azimuths",
 ]
