@@ -1,0 +1,71 @@
+"""The cells of an experiment: what is computed and stored as one piece."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from dsfit.experiment import build
+from dsfit.experiment.rundir import RunDirectory
+from dsfit.experiment.schema import Config
+from dsfit.experiment.validation import Experiment
+
+
+@dataclass(frozen=True)
+class Job:
+    """One cell: a context of a grid point, or a whole grid point for `transmittance`.
+
+    Attributes:
+        index: position in the run.
+        label: for tables and plots.
+        identity: grid values and context, in plain data; a stored cell with another identity is not this one.
+        config: the grid point's config.
+    """
+
+    index: int
+    label: str
+    identity: dict[str, Any]
+    config: Config
+
+
+def jobs(experiment: Experiment) -> list[Job]:
+    """All cells, in a fixed order."""
+    found: list[Job] = []
+    for point in experiment.points:
+        values = list(build.context_values(point.config.contexts))
+        for context in [{}] if experiment.config.kind == "transmittance" else values:
+            identity = {"grid": point.values, "context": context}
+            found.append(Job(len(found), _label(point.config, identity), identity, point.config))
+    return found
+
+
+def _label(config: Config, identity: dict[str, Any]) -> str:
+    parts = [config.fiber.preset]
+    parts += [f"{key.split('.')[-1]} {value}" for key, value in identity["grid"].items() if key != "fiber.preset"]
+    context = identity["context"]
+    if context:
+        parts.append(f"θr {context['theta_r_deg']:g}°")
+        if context["phi_r_deg"]:
+            parts.append(f"φr {context['phi_r_deg']:g}°")
+        if config.scattering.kind == "constant":
+            parts.append(f"n {context['n']:g}")
+            if context["v"] is not None:
+                parts.append(f"v {context['v']:g}")
+    return ", ".join(parts)
+
+
+def run_job(directory: RunDirectory, job: Job, say: Callable[[str], None]) -> None:
+    """Compute a cell and write it."""
+    started = time.perf_counter()
+    if job.config.kind == "transmittance":
+        from dsfit.experiment.transmittance import transmittance
+
+        data, arrays = transmittance(job.config, say)
+    else:
+        from dsfit.experiment.compare import compare
+
+        data, arrays = compare(job, directory, say)
+    data = {"index": job.index, "label": job.label, "identity": job.identity, **data}
+    directory.write_cell(job.index, {**data, "seconds": time.perf_counter() - started}, arrays)

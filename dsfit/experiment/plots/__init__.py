@@ -1,0 +1,40 @@
+"""Figures of a run. They read the run directory's data only; nothing is computed here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from dsfit.experiment.plots.convergence import convergence
+from dsfit.experiment.plots.excess import excess_bars, excess_grid
+from dsfit.experiment.plots.maps import maps
+from dsfit.experiment.plots.style import save, spread, styled
+from dsfit.experiment.rundir import RunDirectory
+
+__all__ = ["draw_all"]
+
+
+def draw_all(directory: RunDirectory, result: dict[str, Any]) -> list[Path]:
+    """Draw every figure that this kind of experiment has; returns the files written."""
+    written: list[Path] = []
+    with styled():
+        for name, figure in _figures(directory, result):
+            written += save(figure, directory.path / "figures", name)
+    return written
+
+
+def _figures(directory: RunDirectory, result: dict[str, Any]) -> Iterator[tuple[str, Figure]]:
+    if result["kind"] == "transmittance":
+        from dsfit.experiment.plots.transmittance import transmittance
+
+        yield from transmittance(directory, result)
+        return
+    yield "convergence", convergence(result)
+    yield "excess", excess_bars(result)
+    if result["kind"] == "sweep" and (grid := excess_grid(result)) is not None:
+        yield "sweep", grid
+    for index in spread(len(result["cells"]), result["config"]["output"]["maps"]):
+        yield f"maps-{index:04d}", maps(result["cells"][index], directory.arrays(index))

@@ -1,0 +1,79 @@
+"""What all figures share: colours that colour-blind readers can tell apart, sizes, and saving as PNG and PDF."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from dsfit.experiment.files import write_bytes
+
+# Okabe and Ito's palette without its yellow, which is too light for lines on white.
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
+
+_RC: dict[str, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.labelsize": 9,
+    "legend.fontsize": 8,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "savefig.dpi": 150,
+    "pdf.fonttype": 42,
+}
+
+
+@contextlib.contextmanager
+def styled() -> Iterator[None]:
+    """Figures made inside use dsfit's settings; the caller's matplotlib is left as it was."""
+    with matplotlib.rc_context(_RC):
+        yield
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure (inches) on the Agg canvas, which needs no display."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def look(index: int) -> dict[str, Any]:
+    """Colour and marker of the method at this index; colours repeat only with another marker."""
+    return {"color": COLORS[index % len(COLORS)], "marker": MARKERS[index % len(MARKERS)]}
+
+
+def save(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write `name.png` and `name.pdf` atomically; returns the two paths."""
+    paths = []
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # laid out once, not once more for every format
+    for kind in ("png", "pdf"):
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format=kind)
+        write_bytes(folder / f"{name}.{kind}", buffer.getvalue())
+        paths.append(folder / f"{name}.{kind}")
+    return paths
+
+
+def spread(count: int, most: int) -> list[int]:
+    """At most `most` indices out of `count`, evenly spread, first and last among them."""
+    if count <= most:
+        return list(range(count))
+    return sorted({round(i * (count - 1) / max(most - 1, 1)) for i in range(most)})
+
+
+def short(label: str, width: int = 28) -> str:
+    """A label that fits: cut in the middle of long names."""
+    return label if len(label) <= width else label[: width // 2] + "…" + label[-(width // 2 - 1) :]

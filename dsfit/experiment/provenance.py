@@ -1,0 +1,105 @@
+"""Where a result came from: code, packages, machine, git state."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from dsfit.experiment.schema import Config
+
+_PACKAGES = ("torch", "numpy", "scipy", "jax", "jaxlib", "optimistix", "OpenEXR", "pydantic", "matplotlib")
+
+
+def version() -> str:
+    """Version of the installed package; "0+source" when run from a tree that is not installed."""
+    try:
+        return importlib.metadata.version("dsfit")
+    except importlib.metadata.PackageNotFoundError:
+        return "0+source"
+
+
+@cache
+def code_version() -> str:
+    """Package version and a hash of all its sources: any change to the code makes another run."""
+    root = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return f"{version()}+{digest.hexdigest()[:12]}"
+
+
+def run_id(config: Config) -> str:
+    """Hash of everything that decides the numbers: the resolved config without where it is written, files it reads,
+    and the code."""
+    data = config.model_dump(exclude={"output", "title"})
+    if path := data["light"].get("path"):
+        data["light"]["path"] = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    identity = json.dumps([data, code_version()], sort_keys=True)
+    return hashlib.sha256(identity.encode()).hexdigest()[:12]
+
+
+def now() -> str:
+    """The present time, UTC, ISO 8601."""
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+
+
+def provenance() -> dict[str, Any]:
+    """Versions, machine and git state, as plain data."""
+    return {
+        "dsfit": code_version(),
+        "python": sys.version.split()[0],
+        "packages": {name: _package_version(name) for name in _PACKAGES},
+        "machine": {
+            "system": f"{platform.system()} {platform.release()}",
+            "processor": _processor(),
+            "cores": os.cpu_count(),
+        },
+        "git": _git_state(),
+    }
+
+
+def _package_version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def _git_state() -> dict[str, Any] | None:
+    """Commit of the source tree and whether it has changes; None outside a git work tree."""
+    root = Path(__file__).resolve().parents[2]
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(
+            ["git", "-C", str(root), *arguments], capture_output=True, text=True, timeout=20, check=True
+        )
+        return done.stdout.strip()
+
+    try:
+        if Path(git("rev-parse", "--show-toplevel")).resolve() != root:
+            return None
+        return {
+            "commit": git("rev-parse", "HEAD"),
+            "changed": bool(git("status", "--porcelain", "--untracked-files=no")),
+        }
+    except (OSError, subprocess.SubprocessError):
+        return None
