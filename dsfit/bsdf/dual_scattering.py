@@ -38,7 +38,7 @@ class DualScattering:
         d_b: density factor of back scattering, in [0, 1].
         azimuthal: "marschner" (exact roots, TRT caustic treated), "raw" (caustic left) or "simplified" (eqs 21, 25).
         convention: "consistent", "printed", or a `Convention`.
-        precision: "exact" (1e-9) or "table": N^G from a spline of its exact values, tens of times faster, within 1e-3
+        precision: "exact" (1e-9) or "table": N^G from a spline of its exact values, tens of times faster, within 2e-3
             of each lobe's largest value (1e-5 for R and TT) and 1e-5 in integrals. The table holds no gradients for
             the fibre, serves one round fibre, and not the `raw` azimuths, whose N^G has square-root edges.
 

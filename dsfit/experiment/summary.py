@@ -140,6 +140,8 @@ def _time(seconds: float) -> str:
 
 def terminal_table(result: dict[str, Any]) -> Table:
     """The summary as a rich table."""
+    if result["kind"] == "transmittance":
+        return _transmittance_table(result)
     cells = result["cells"]
     table = Table(
         title=_title(result), title_justify="left", title_style="bold", caption=caption(result), caption_justify="left"
@@ -152,8 +154,36 @@ def terminal_table(result: dict[str, Any]) -> Table:
     return table
 
 
+_FIT_COLUMNS = ("centre_deg", "width_deg", "excess", "width_centred_deg", "excess_centred", "excess_cosine")
+SHOWN_N = (1, 2, 5, 10, 20, 50)
+
+
+def _transmittance_rows(result: dict[str, Any]) -> list[list[str]]:
+    rows = []
+    for cell in result["cells"]:
+        fits = cell["fits"]
+        chosen = [fit for fit in fits if fit["n"] in SHOWN_N] or fits
+        rows += [[cell["label"], f"{fit['n']:g}", *(_short(fit[key]) for key in _FIT_COLUMNS)] for fit in chosen]
+    return rows
+
+
+def _transmittance_table(result: dict[str, Any]) -> Table:
+    table = Table(title=_title(result), title_justify="left", title_style="bold")
+    for name in ("fibre", "n", *_FIT_COLUMNS):
+        table.add_column(
+            name.replace("_deg", " / °").replace("_", "\n"), justify="left" if name == "fibre" else "right"
+        )
+    for row in _transmittance_rows(result):
+        table.add_row(*row)
+    return table
+
+
 def markdown(result: dict[str, Any]) -> str:
     """The summary as a Markdown table, with the same numbers."""
+    if result["kind"] == "transmittance":
+        head = ["fibre", "n", *_FIT_COLUMNS]
+        body = [head, ["---"] * len(head), *_transmittance_rows(result)]
+        return f"# {_title(result)}\n\n" + "\n".join("| " + " | ".join(row) + " |" for row in body) + "\n"
     lines = [f"# {_title(result)}", "", "| method | " + " | ".join(f"{a} {b}" for a, b, _ in _COLUMNS) + " |"]
     lines.append("|---|" + "---:|" * len(_COLUMNS))
     for row in rows(result["cells"]):
@@ -163,7 +193,8 @@ def markdown(result: dict[str, Any]) -> str:
 
 def _title(result: dict[str, Any]) -> str:
     count = len(result["cells"])
-    return f"{result['title'] or result['name']} ({count} context{'s' if count != 1 else ''})"
+    what = "fibre" if result["kind"] == "transmittance" else "context"
+    return f"{result['title'] or result['name']} ({count} {what}{'s' if count != 1 else ''})"
 
 
 def caption(result: dict[str, Any]) -> str:
