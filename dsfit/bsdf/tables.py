@@ -44,7 +44,7 @@ class AzimuthTable:
     in [0, pi].
 
     For N^G of the shipped fibres the error of R and TT is below 1e-5 of the lobe's largest value, that of TRT below
-    1e-3, where the range of offsets that a glint gathers is cut off (a kink in theta_diff); integrals of the BSDF
+    2e-3, where the range of offsets that a glint gathers is cut off (a kink in theta_diff); integrals of the BSDF
     agree to 1e-5 (tests/bsdf/test_tables.py). About 0.6 us per direction against 50 for the exact integral, both on
     one core. Differentiable in both angles.
     """
