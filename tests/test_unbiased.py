@@ -51,7 +51,7 @@ def z_scores(strategies: list[Proposal], seed: int, samples: int = SAMPLES, **op
 
 
 def cases() -> dict[tuple[str, str, str], list[Proposal]]:
-    """Strategies by (name, heuristic, model): each proposal beside the uniform sphere, all together, and the structured family."""
+    """Strategies by (name, heuristic, model): each proposal with the uniform sphere, all of them, the structured."""
     integrand, context, _ = scene()
     chapter = chapter_proposals(integrand.bsdf, learnable=False)
     structured = StructuredProposal(integrand.bsdf, context, defensive=0.05)

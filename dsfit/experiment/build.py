@@ -46,7 +46,11 @@ def convention(config: Config) -> Convention:
 def bsdf(config: Config, dtype: torch.dtype = torch.float64) -> DualScattering:
     """The dual scattering BSDF."""
     b = config.bsdf
-    return DualScattering(fiber(config.fiber, dtype), b.d_f, b.d_b, b.azimuthal, convention(config))
+    strand = fiber(config.fiber, dtype)
+    precision = b.precision
+    if precision == "auto":
+        precision = "table" if strand.is_round and b.azimuthal != "raw" else "exact"
+    return DualScattering(strand, b.d_f, b.d_b, b.azimuthal, convention(config), precision)
 
 
 def light(config: Config) -> Light:

@@ -41,12 +41,17 @@ class FiberConfig(Section):
 
 
 class BsdfConfig(Section):
-    """`[bsdf]`: density factors, azimuthal model, convention by name or as `{ base = name, switch = value }`."""
+    """`[bsdf]`: density factors, azimuthal model, convention by name or as `{ base = name, switch = value }`.
+
+    `precision` "auto" takes tables of N^G where the BSDF offers them (round fibres, caustic treated), the exact
+    integrals elsewhere.
+    """
 
     d_f: Share = 0.7
     d_b: Share = 0.7
     azimuthal: Literal["marschner", "raw", "simplified"] = "marschner"
     convention: str | dict[str, str | int | bool] = "consistent"
+    precision: Literal["auto", "exact", "table"] = "auto"
 
 
 class ConstantLight(Section):

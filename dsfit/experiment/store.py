@@ -87,7 +87,7 @@ def _compact(value: Any) -> dict[str, Any] | None:
     if isinstance(value, Fiber):
         return dict(value.parameters())
     if type(value) is DualScattering:
-        names = ("fiber", "d_f", "d_b", "convention")
+        names = ("fiber", "d_f", "d_b", "convention", "precision")
         return {"azimuthal": value.model, **{name: getattr(value, name) for name in names}}
     return None
 
