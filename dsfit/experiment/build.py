@@ -146,5 +146,10 @@ def check(raw: RawConfig, config: Config) -> None:
             known = error.field.split(".")[-1]
             key = (*key, known if known in given else str(error.value) if str(error.value) in given else "base")
         raise raw.error(key, error.allowed) from None
+    try:
+        integrand(config)
+    except InputError as error:
+        section = error.field.split(".")[0]
+        raise library_error(raw, section if section in ("light", "fiber") else "bsdf", error) from None
     for index, method in enumerate(config.methods):
         check_method(raw, index, method)

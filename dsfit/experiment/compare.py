@@ -126,14 +126,16 @@ def _estimates(
             deviation.append(error)
             claimed.append(estimate.standard_error.to(torch.float64).square().sum(-1) / size**2)
         points.append(_point(estimate.samples, squared, seconds, claimed, deviation, variance))
-    pooled = _samples_for(points, variance, config.uniforms)
+    # The optimal heuristic reaches its predicted variance only once alpha is known well enough.
+    asymptotic = config.uniforms == "random" and plan.heuristic_name != "optimal"
+    needed = _samples_for(points, variance, asymptotic)
     per_sample = points[-1]["seconds"][1] / points[-1]["samples"]
     usable = [p["predicted_rmse"] / p["rmse"] for p in points if p["rmse"] > 0 and math.isfinite(p["predicted_rmse"])]
     return {
         "estimates": points,
         "seconds_per_sample": per_sample,
-        "samples_to_1_percent": pooled,
-        "seconds_to_1_percent": pooled * per_sample,
+        "samples_to_1_percent": needed,
+        "seconds_to_1_percent": needed * per_sample,
         "predicted_over_measured": float(np.exp(np.mean(np.log(usable))))
         if usable and config.uniforms == "random"
         else math.nan,
@@ -165,22 +167,23 @@ def _point(
     }
 
 
-def _samples_for(points: list[dict[str, Any]], variance: float, uniforms: str) -> float:
-    """Samples for a relative RMSE of 1 %: from the predicted variance for independent samples, else from the measured
-    curve.
+def _samples_for(points: list[dict[str, Any]], variance: float, asymptotic: bool) -> float:
+    """Samples for a relative RMSE of 1 %: from the predicted variance, or else from the measured curve.
 
-    The curve's slope is a least-squares fit, so that points of quasi-random estimates can be extended.
+    The curve is interpolated in log N and log error; beyond its ends the error is taken to fall as 1 / sqrt(N).
     """
-    if uniforms == "random" and math.isfinite(variance):
+    if asymptotic:
         return max(1.0, variance / TARGET**2)
     log_n = np.log([p["samples"] for p in points])
-    log_e = np.log([max(p["rmse"], 1e-300) for p in points])
-    if len(points) == 1 or uniforms == "random":
-        return max(1.0, float(np.exp(np.mean(log_n + 2 * (log_e - math.log(TARGET))))))
-    slope, offset = np.polyfit(log_n, log_e, 1)
-    if slope >= 0:
-        return math.inf
-    return max(1.0, float(np.exp((math.log(TARGET) - offset) / slope)))
+    log_e = np.minimum.accumulate(np.log([max(p["rmse"], 1e-300) for p in points]))
+    goal = math.log(TARGET)
+    if log_e[0] <= goal:
+        found = log_n[0] + 2 * (log_e[0] - goal)
+    elif log_e[-1] > goal:
+        found = log_n[-1] + 2 * (log_e[-1] - goal)
+    else:
+        found = np.interp(-goal, -log_e, log_n)
+    return max(1.0, float(np.exp(found)))
 
 
 def _map_grid(context: Context) -> tuple[Tensor, dict[str, np.ndarray]]:

@@ -20,7 +20,9 @@ from dsfit.mis.variance import MisVariance, mis_variance
 RTOL = 1e-3
 FLOOR = 1e-4
 """Excess below this is resolved to RTOL times this, not to RTOL."""
-MAX_EVALUATIONS = 3_000_000
+MAX_EVALUATIONS = 1_000_000
+DIVERGED = 0.02
+"""An error bound above this, relative to the second moment, after MAX_EVALUATIONS means an integral that diverges."""
 
 
 def judge(plans: Sequence[Plan], setting: Setting, reference: Any) -> list[dict[str, float]]:
@@ -33,25 +35,39 @@ def judge(plans: Sequence[Plan], setting: Setting, reference: Any) -> list[dict[
     the last integral is 0 for the balance heuristic and a single proposal. What fixed sample counts per strategy gain
     is subtracted; it comes from the nodes. For the optimal heuristic, alpha comes from the nodes and the variance
     with that alpha, `∫ |F - alpha.p|^2 / P`, is what counts; its excess, (N Var + |I|^2) / M* - 1, can be negative.
-    All integrals are adaptive, over half the azimuth where F is even.
+    All integrals are adaptive, over half the azimuth where F is even. A method without density somewhere where F is
+    not 0 is biased; its excess is inf, as is that of one whose second moment diverges (p falls to 0 where F does not).
     """
+    judged = {id(plan): _NOTHING for plan in plans}
+    sound = [plan for plan in plans if _covers(plan, setting)]
+    if sound:
+        judged |= _integrate(sound, setting, reference)
+    return [judged[id(plan)] for plan in plans]
+
+
+_NOTHING = {"excess": math.inf, "excess_error": 0.0, "largest_weight": math.inf, "variance": math.inf}
+
+
+def _integrate(plans: list[Plan], setting: Setting, reference: Any) -> dict[int, dict[str, float]]:
     from dsfit.quality import _cubature
 
     first = [_from_nodes(plan, setting) for plan in plans]
-    scales = [max(float(f.excess), FLOOR) if math.isfinite(float(f.excess)) else 1.0 for f in first]
+    norm, m_star = float(reference.norm), float(reference.m_star)
     integral = float(reference.value.square().sum())
-    shift = 1 - integral / float(
-        reference.m_star
-    )  # of the optimal heuristic: excess = ∫ |F - alpha.p|^2 / P / M* - shift
-    for k, plan in enumerate(plans):
+    shift = 1 - integral / m_star  # of the optimal heuristic: excess = ∫ |F - alpha.p|^2 / P / M* - shift
+    units = []  # what each column is divided by, so that all columns are of order 1
+    for plan, nodes in zip(plans, first, strict=True):
+        guess = float(nodes.excess)
         if plan.heuristic_name == "optimal":
             plan.alpha = _alpha(plan, setting)
-            scales[k] = max(scales[k] + shift, FLOOR)
-    norm, even = float(reference.norm), setting.integrand.is_even
+            guess = float(nodes.variance_excess) + shift
+        units.append(FLOOR + (max(guess, FLOOR) if math.isfinite(guess) else 1.0))
+    even = setting.integrand.is_even
     largest = torch.zeros(len(plans), dtype=torch.float64)
 
     def columns(omega: Tensor, value: Tensor) -> Tensor:
-        target = torch.linalg.vector_norm(value, dim=-1) / norm
+        value = value / norm
+        target = torch.linalg.vector_norm(value, dim=-1)
         sides = [omega]
         if even:  # F is the same at phi and -phi, but a density need not be
             phi = wrap(setting.context.phi_r - omega[..., 1])
@@ -60,28 +76,37 @@ def judge(plans: Sequence[Plan], setting: Setting, reference: Any) -> list[dict[
         for side in sides:
             known: dict[int, Tensor] = {}
             for k, plan in enumerate(plans):
-                gap, ratio = _gap(plan, setting, side, value / norm, norm, known)
-                total[:, k] += (gap + FLOOR * target) / (scales[k] + FLOOR) / len(sides)
-                largest[k] = max(float(largest[k]), float(ratio.max()))
+                gap, ratio = _gap(plan, setting, side, value, norm, known)
+                total[:, k] += (gap + FLOOR * target) / units[k] / len(sides)
+                largest[k] = torch.maximum(largest[k], ratio.max())
         total[:, -1] = target
         return total
 
     with torch.no_grad():
         found = _cubature(setting.integrand, setting.context, columns, RTOL, MAX_EVALUATIONS, even)
-    results = []
+    judged = {}
     for k, (plan, nodes) in enumerate(zip(plans, first, strict=True)):
-        unit = scales[k] + FLOOR
-        excess = float(found.value[k]) * unit - FLOOR
+        excess = float(found.value[k]) * units[k] - FLOOR
         if plan.alpha is not None:
             excess -= shift
         elif plan.model == "multi":
             excess -= float(nodes.excess - nodes.variance_excess)
-        variance = (float(reference.m_star) * (1 + excess) - integral) / integral
-        error = float(found.error[k]) * unit
-        results.append(
-            {"excess": excess, "excess_error": error, "largest_weight": float(largest[k]), "variance": variance}
-        )
-    return results
+        error = float(found.error[k]) * units[k]
+        if error > DIVERGED * (1 + abs(excess)):
+            excess = math.inf
+        judged[id(plan)] = {
+            "excess": excess,
+            "excess_error": error,
+            "largest_weight": float(largest[k]),
+            "variance": (m_star * (1 + excess) - integral) / integral,
+        }
+    return judged
+
+
+def _covers(plan: Plan, setting: Setting) -> bool:
+    """Whether some strategy has density wherever F is not 0; otherwise the estimate is biased."""
+    alive = (setting.log_p(plan.strategies) > -torch.inf).any(dim=0)
+    return bool((alive | (setting.nodes.norm == 0)).all())
 
 
 def _from_nodes(plan: Plan, setting: Setting) -> MisVariance:

@@ -182,7 +182,7 @@ def _fitted(method: FittedMethod, setting: Setting) -> Plan:
     start = StructuredProposal(setting.integrand.bsdf, setting.context, method.defensive)
     start_seconds = time.perf_counter() - clock
     if method.max_steps == 0:
-        return Plan([start.requires_grad_(False)], [method.family], fit={"seconds": start_seconds}, fitted=True)
+        return Plan([start.requires_grad_(False)], [method.family], fit={"seconds": start_seconds})
     options = {"starts": method.starts, "seed": setting.config.estimate.seed, "nodes": nodes}
     if method.max_steps is not None:
         options["max_steps"] = method.max_steps

@@ -32,6 +32,11 @@ class RunFailure(RuntimeError):
     """A run that could not be finished; what was done stays and is used by the next attempt."""
 
 
+def slug(name: str) -> str:
+    """A method's name as part of a file name."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip(".-") or "method"
+
+
 class RunDirectory:
     """Reads and writes the parts of one run directory; see the module's docstring."""
 
@@ -44,8 +49,7 @@ class RunDirectory:
 
     def proposal_path(self, index: int, method: str) -> Path:
         """File of a cell's fitted proposal."""
-        safe = re.sub(r"[^A-Za-z0-9._-]+", "-", method).strip(".-") or "method"
-        return self.path / "proposals" / f"{index:04d}-{safe}.npz"
+        return self.path / "proposals" / f"{index:04d}-{slug(method)}.npz"
 
     def cell(self, index: int, identity: dict[str, Any]) -> dict[str, Any] | None:
         """A finished cell, or None if it is missing, damaged, or belongs to something else: then it is computed

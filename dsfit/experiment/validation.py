@@ -14,6 +14,7 @@ from pydantic.fields import FieldInfo
 
 from dsfit.errors import InputError
 from dsfit.experiment.reader import ConfigError, RawConfig, did_you_mean, dotted, read, set_value
+from dsfit.experiment.rundir import slug
 from dsfit.experiment.schema import Config
 
 MAX_CELLS = 100_000
@@ -127,9 +128,9 @@ def _cross_check(raw: RawConfig, config: Config) -> None:
         raise raw.error(("sweep", "grid"), "at least one dotted key with a list of values, as kind is 'sweep'", {})
     seen: set[str] = set()
     for index, method in enumerate(config.methods):
-        if method.name in seen:
-            raise raw.error(("methods", index, "name"), "names that differ from each other")
-        seen.add(method.name)
+        if slug(method.name) in seen:
+            raise raw.error(("methods", index, "name"), "names that differ in their letters and digits")
+        seen.add(slug(method.name))
     lengths = {len(x) for x in _context_lists(config) if len(x) != 1}
     if config.contexts.combine == "zip" and len(lengths) > 1:
         raise raw.error(

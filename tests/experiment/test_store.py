@@ -16,7 +16,10 @@ from dsfit.errors import InputError
 from dsfit.experiment.store import _Reader, _Writer, load_proposal, save_proposal
 from dsfit.proposals.azimuth import CosineHalf, WrappedGaussian
 from dsfit.proposals.base import Distribution, Product, Proposal
+from dsfit.proposals.chapter import chapter_proposals
 from dsfit.proposals.gaussian_lobe import GaussianLobe
+from dsfit.proposals.mixture import Mixture
+from dsfit.proposals.structured import StructuredProposal
 
 
 def example() -> Product:
@@ -36,6 +39,25 @@ def test_a_loaded_proposal_samples_and_evaluates_as_before(tmp_path: Path) -> No
     }
     loaded(context).log_prob(torch.zeros(3, 2, dtype=torch.float64)).sum().backward()
     assert all(p.grad is not None for p in loaded.parameters())
+
+
+_BSDF = DualScattering(Fiber.preset("blond", eta=1.5))
+_CONTEXT = Context(torch.tensor(0.3, dtype=torch.float64), 0.5, 2.0, 0.3)
+_ALL = {
+    **chapter_proposals(_BSDF),
+    "mixture": Mixture([chapter_proposals(_BSDF)["R"], chapter_proposals(_BSDF)["back"]]),
+    "structured": StructuredProposal(_BSDF, _CONTEXT),
+}
+
+
+@pytest.mark.parametrize("name", _ALL)
+def test_every_proposal_comes_back(tmp_path: Path, name: str) -> None:
+    proposal = _ALL[name]
+    save_proposal(tmp_path / "p.npz", proposal)
+    before, after = proposal(_CONTEXT), load_proposal(tmp_path / "p.npz")(_CONTEXT)
+    u = torch.rand(200, before.dimension, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    for a, b in zip(before.sample_with_log_prob(u), after.sample_with_log_prob(u), strict=True):
+        assert torch.equal(a, b)
 
 
 def test_fixed_values_stay_fixed_and_shared_parts_stay_shared(tmp_path: Path) -> None:
@@ -61,10 +83,6 @@ def test_a_bsdf_is_stored_by_its_arguments() -> None:
 class _Foreign(Proposal):
     def forward(self, context: Context) -> Distribution:
         raise NotImplementedError
-
-
-class _Holder(Product):
-    pass
 
 
 def test_what_cannot_be_saved_is_named(tmp_path: Path) -> None:

@@ -75,6 +75,8 @@ def message(**data: Any) -> str:
         ({"contexts": {"n": [0, 1], "theta_r_deg": [0, 1, 2], "combine": "zip"}}, ["contexts.combine", "equal length"]),
         ({"methods": []}, ["methods: got []", "at least one [[methods]]"]),
         ({"methods": [UNIFORM, UNIFORM]}, ["methods.1.name: got 'uniform'", "differ"]),
+        ({"methods": [UNIFORM, {**UNIFORM, "name": "uniform "}]}, ["methods.1.name: got 'uniform '", "differ"]),
+        ({"bsdf": {"precision": "table"}, "fiber": {"eccentricity": 0.9}}, ["bsdf.precision: got 'table'"]),
         ({"methods": [{"kind": "uniform"}]}, ["methods.0.name: got None", "this key is required"]),
         ({"methods": [{"name": "a", "kind": "single", "proposal": "M_X"}]}, ["methods.0.proposal: got 'M_X'", "M_R"]),
         (

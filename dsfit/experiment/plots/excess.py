@@ -16,8 +16,14 @@ FLOOR = 1e-6
 
 def _table(result: dict[str, Any]) -> tuple[list[str], np.ndarray]:
     names = [m["name"] for m in result["cells"][0]["methods"]]
-    values = [[number(m["excess"]) for m in cell["methods"]] for cell in result["cells"]]
-    return names, np.maximum(np.array(values), FLOOR)
+    values = np.array([[number(m["excess"]) for m in cell["methods"]] for cell in result["cells"]])
+    return names, np.maximum(values, FLOOR)
+
+
+def _ends(values: np.ndarray) -> tuple[float, float]:
+    """Ends of a logarithmic axis for the finite values; infinite ones end at its top."""
+    finite = values[np.isfinite(values)]
+    return 10 ** np.floor(np.log10(finite.min()) - 0.3), 10 ** np.ceil(np.log10(finite.max()) + 0.3)
 
 
 def excess_bars(result: dict[str, Any]) -> Figure:
@@ -31,14 +37,14 @@ def excess_bars(result: dict[str, Any]) -> Figure:
         1.6 + max(4.5, 0.17 * len(names) * len(cells) + 0.5 * len(cells)), 3.4 + 0.2 * (len(names) // 3)
     )
     axis = figure.subplots()
-    bottom = 10 ** np.floor(np.log10(np.nanmin(values[np.isfinite(values)])) - 0.3)
+    bottom, top = _ends(values)
     width = 0.85 / len(names)
     for index, name in enumerate(names):
         x = np.arange(len(cells)) + (index - (len(names) - 1) / 2) * width
         hatch = "///" if index >= len(COLORS) else None
         axis.bar(
             x,
-            values[:, index] - bottom,
+            np.minimum(values[:, index], top) - bottom,
             width,
             bottom=bottom,
             color=look(index)["color"],
@@ -47,7 +53,11 @@ def excess_bars(result: dict[str, Any]) -> Figure:
             edgecolor="white",
             linewidth=0.3,
         )
-    axis.set(yscale="log", ylabel="excess  M(p) / M* − 1", ylim=(bottom, None))
+    for text, where, at in (("< 0", values <= FLOOR, FLOOR), ("∞", np.isinf(values), top)):
+        for k, index in zip(*np.nonzero(where), strict=True):
+            x = k + (index - (len(names) - 1) / 2) * width
+            axis.text(x, at, text, fontsize=7, ha="center", va="bottom")
+    axis.set(yscale="log", ylabel="excess  M(p) / M* − 1", ylim=(bottom, top * 3))
     axis.set_xticks(np.arange(len(cells)), [cell["label"].replace(", ", "\n") for cell in cells])
     axis.grid(True, axis="y")
     figure.legend(loc="outside lower center", ncols=min(4, len(names)), frameon=False)
@@ -58,6 +68,7 @@ def excess_bars(result: dict[str, Any]) -> Figure:
 def _dots(result: dict[str, Any], names: list[str], values: np.ndarray) -> Figure:
     figure = new_figure(7.2, 1.4 + 0.34 * len(names))
     axis = figure.subplots()
+    values = np.minimum(values, _ends(values)[1])
     shift = np.linspace(-0.28, 0.28, len(values))
     for index in range(len(names)):
         style = look(index)
