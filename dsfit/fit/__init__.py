@@ -11,7 +11,7 @@ import types
 from typing import Any
 
 from dsfit.fit.fit import Fit, fit
-from dsfit.fit.objectives import OBJECTIVES, Excess, ForwardKL, Objective, Target, VarianceCost
+from dsfit.fit.objectives import OBJECTIVES, Excess, ForwardKL, LogExcess, Objective, Target, VarianceCost
 from dsfit.fit.problem import FunctionProblem, Problem, compress
 from dsfit.fit.proposal_problem import ProposalProblem
 from dsfit.fit.solvers import SOLVERS, minimise
@@ -25,6 +25,7 @@ __all__ = [
     "ForwardKL",
     "FunctionProblem",
     "HistoryEntry",
+    "LogExcess",
     "Objective",
     "Problem",
     "ProposalProblem",

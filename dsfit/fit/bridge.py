@@ -33,6 +33,7 @@ from jax import lax
 from torch import Tensor
 
 from dsfit.errors import InputError
+from dsfit.fit.problem import TRANSFORMS, forward_jacobian
 
 PIECE = 8192
 """How many float64 numbers cross in one piece: 64 kB, below the 100 kB up to which JAX copies without its thread
@@ -54,10 +55,10 @@ def value_and_jacobian(fn: TorchFunction, y: Tensor) -> tuple[Tensor, Tensor]:
     """Value [...] and dense Jacobian [..., P] of a torch function of a vector [P]: reverse mode for a scalar, else
     forward mode."""
     if fn(y.detach()).ndim == 0:
-        gradient, value = torch.func.grad_and_value(fn)(y)
+        with TRANSFORMS:
+            gradient, value = torch.func.grad_and_value(fn)(y)
         return value, gradient
-    jacobian, value = torch.func.jacfwd(lambda y: (fn(y),) * 2, has_aux=True)(y)
-    return value, jacobian
+    return forward_jacobian(fn, y)
 
 
 def register(fn: TorchFunction, jacobian: ValueAndJacobian | None = None) -> int:

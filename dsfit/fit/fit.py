@@ -24,7 +24,7 @@ AT_BOUND = 1e-3
 value is at a bound."""
 
 
-NATURAL = {"floor": 1e-3, "reach": 2.0}
+NATURAL = {"floor": 1e-3, "damping": 0.1, "reach": 2.0}
 """Solver options of a fit, where one unit of a parameter is one radian, one e-fold or one unit of a logit: steps
 longer than 2 kill components of a mixture by throwing them where no derivative brings them back."""
 
@@ -95,14 +95,14 @@ def fit(
             dtype of the proposal.
         integrand: `integrand(omega, context) -> [..., C]`; may be None if `nodes` are given.
         context: one context, or a batch [*batch] that one set of parameters is fitted to, by the mean of the objective.
-        objective: name or `Objective`: "excess", "forward_kl", "variance_cost".
+        objective: name or `Objective`: "excess", "log_excess", "forward_kl", "variance_cost".
         solver: name in `SOLVERS`.
         starts: number of starts: the parameters as given, and copies moved by normal noise of std `jitter`; the best
             result wins.
         seed: seed of that noise.
         nodes: quadrature nodes with fields omega [Q, 2], weight [Q], value [Q, C], or such a triple; a list of them,
             in the order of the flattened batch, for a batch of contexts. Left out,
-            `dsfit.reference.quadrature_nodes(integrand, context, rtol=rtol)` makes them.
+            `dsfit.quality.quadrature_nodes(integrand, context, rtol=rtol)` makes them.
         weights: positive weights of the contexts in the mean, of the batch's shape.
         max_steps, tolerance: see `minimise`.
         max_seconds: wall time for all starts together.
@@ -196,7 +196,7 @@ def make_targets(
     if nodes is None:
         if integrand is None:
             raise InputError("integrand", None, "an integrand, or nodes")
-        from dsfit.reference import quadrature_nodes
+        from dsfit.quality import quadrature_nodes
 
         each: Iterable[Any] = [quadrature_nodes(integrand, contexts[i], rtol=rtol) for i in range(count)]
     elif context.batch_shape == () and not (isinstance(nodes, list) and not isinstance(nodes[0], Tensor)):

@@ -152,6 +152,20 @@ class Excess(Objective):
         return excess_residuals(log_p, weight, log_best)
 
 
+class LogExcess(Objective):
+    """`log(1 + excess) = log(M / M*)`: its mean over contexts is a geometric mean of second moments, which a few bad
+    contexts do not dominate. For fits of one proposal to many contexts; not a sum of squares."""
+
+    name = "log_excess"
+    least_squares = False
+
+    def residuals(self, log_p: Tensor, weight: Tensor, log_best: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def loss(self, log_p: Tensor, weight: Tensor, log_best: Tensor) -> Tensor:
+        return torch.log1p(excess_residuals(log_p, weight, log_best).square().sum(0))
+
+
 class ForwardKL(Objective):
     """The divergence `KL(P* | p)`: the cross entropy of maximum-likelihood fits. Milder than the excess on missing
     tails."""
@@ -212,7 +226,7 @@ class VarianceCost(Objective):
         return 1.0 - target.grey
 
 
-OBJECTIVES: dict[str, Callable[[], Objective]] = {cls.name: cls for cls in (Excess, ForwardKL, VarianceCost)}
+OBJECTIVES: dict[str, Callable[[], Objective]] = {cls.name: cls for cls in (Excess, LogExcess, ForwardKL, VarianceCost)}
 """Objectives by name, as made without arguments."""
 
 

@@ -12,11 +12,16 @@ rows as with ten thousand.
 
 from __future__ import annotations
 
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
+
+
+TRANSFORMS = threading.RLock()
+"""Held around torch.func transforms: torch's forward mode keeps its level in one variable for all threads."""
 
 
 def compress(residuals: Tensor, jacobian: Tensor, *, rows: int = 65536) -> tuple[Tensor, Tensor]:
@@ -74,7 +79,8 @@ def forward_jacobian(
         return torch.func.jvp(function, (y,), (tangent,))
 
     basis = torch.eye(y.numel(), dtype=y.dtype, device=y.device)
-    parts = [torch.func.vmap(column, out_dims=(None, -1))(part) for part in basis.split(chunk or len(basis))]
+    with TRANSFORMS:
+        parts = [torch.func.vmap(column, out_dims=(None, -1))(part) for part in basis.split(chunk or len(basis))]
     return parts[0][0], torch.cat([jacobian for _, jacobian in parts], dim=-1)
 
 
@@ -99,6 +105,10 @@ class Problem(ABC):
     def linearise(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """Compressed residuals [P + 1] and Jacobian [P + 1, P]; least-squares problems only."""
         raise NotImplementedError
+
+    def sampled_gradient(self, y: Tensor, count: int, generator: torch.Generator) -> tuple[float, Tensor]:
+        """Unbiased estimate of value and gradient from `count` terms of a mean; problems that are no mean give all."""
+        return self.gradient(y)
 
 
 class FunctionProblem(Problem):
@@ -141,7 +151,8 @@ class FunctionProblem(Problem):
             return result, result
 
         if self.reverse:
-            jacobian, residuals = torch.func.jacrev(twice, has_aux=True, chunk_size=self.chunk)(y)
+            with TRANSFORMS:
+                jacobian, residuals = torch.func.jacrev(twice, has_aux=True, chunk_size=self.chunk)(y)
         else:
             residuals, jacobian = forward_jacobian(self.function, y, self.chunk)
         return compress(residuals.detach(), jacobian.detach())

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +14,7 @@ from torch import Tensor, nn
 from dsfit.context import Context
 from dsfit.errors import InputError
 from dsfit.fit.objectives import Objective, Target
-from dsfit.fit.problem import Problem, compress, forward_jacobian
+from dsfit.fit.problem import TRANSFORMS, Problem, compress, forward_jacobian
 
 BLOCK = 1 << 17
 """Nodes evaluated at a time."""
@@ -184,9 +185,21 @@ class ProposalProblem(Problem):
             return float(sum(self._block_value(y, block) for block in self.blocks))
 
     def gradient(self, y: Tensor) -> tuple[float, Tensor]:
+        return self._gradient(y, self.blocks)
+
+    def sampled_gradient(self, y: Tensor, count: int, generator: torch.Generator) -> tuple[float, Tensor]:
+        if count >= len(self.targets):
+            return self.gradient(y)
+        shares = torch.tensor([target.share for target in self.targets], dtype=torch.float64)
+        drawn = torch.multinomial(shares, count, replacement=True, generator=generator)
+        # Drawn in proportion to their shares, all count alike.
+        chosen = [replace(self.targets[i], share=float(shares.sum()) / count) for i in drawn.tolist()]
+        return self._gradient(y, _blocks(chosen))
+
+    def _gradient(self, y: Tensor, blocks: Sequence[_Block]) -> tuple[float, Tensor]:
         y = y.detach().to(self.device).requires_grad_()
         value, gradient = 0.0, torch.zeros_like(y)
-        for block in self.blocks:
+        for block in blocks:
             with torch.enable_grad():
                 part = self._block_value(y, block)
                 if part.requires_grad:
@@ -246,7 +259,7 @@ class ProposalProblem(Problem):
             return log_p, log_p
 
         each: Callable = torch.func.vmap(torch.func.grad(one, has_aux=True), (None, 0), chunk_size=CHUNK)
-        with _no_slow_vmap(), torch.no_grad():
+        with TRANSFORMS, _no_slow_vmap(), torch.no_grad():
             jacobian, log_p = each(y, target.omega)
         return log_p, jacobian
 

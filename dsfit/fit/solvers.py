@@ -53,7 +53,7 @@ SOLVERS: dict[str, Solver] = {
         Solver("optimistix.bfgs", False, 500, _OPTIMISTIX, "bfgs", {**_FLOOR}),
         Solver("optimistix.nelder_mead", False, 10000, _OPTIMISTIX, "nelder_mead", {**_FLOOR, "simplex": 0.3}),
         Solver("torch.lbfgs", False, 500, _TORCH, "lbfgs", {**_FLOOR, "memory": 20}),
-        Solver("torch.adam", False, 1000, _TORCH, "adam", {"rate": 0.05, "final_rate": 1e-3}),
+        Solver("torch.adam", False, 1000, _TORCH, "adam", {"rate": 0.05, "final_rate": 1e-3, "contexts": 0, "seed": 0}),
     )
 }
 """All solvers by name."""
@@ -92,7 +92,8 @@ def minimise(
         options: further options of the solver (`SOLVERS[name].options`): `floor` of the scales of the variables
             (`tracking.column_scale`); first `damping` relative to the largest element of J^T J; `reach`, the longest
             step of any one parameter (a longer one is refused unevaluated); first edge of the `simplex`; `memory` of
-            L-BFGS; first and final learning `rate`.
+            L-BFGS; first and final learning rate of Adam (`rate`, `final_rate`), and how many `contexts` to
+            draw for each of its steps (0: all), with which `seed`.
 
     Returns:
         `SolverResult`; numerical failure is not an exception but a `reason`, with the best point seen.

@@ -78,41 +78,58 @@ def lbfgs(
 
 
 def adam(
-    name: str, tracker: Tracker, *, max_steps: int, tolerance: float, absolute: float, rate: float, final_rate: float
+    name: str,
+    tracker: Tracker,
+    *,
+    max_steps: int,
+    tolerance: float,
+    absolute: float,
+    rate: float,
+    final_rate: float,
+    contexts: int,
+    seed: int,
 ) -> SolverResult:
     """Adam with a learning rate falling on a cosine from `rate` to `final_rate` over `max_steps`, in units of the
     parameters.
 
     Converged when a tenth of `max_steps` (at least 50 steps) no longer lowered the best value by more than the
-    tolerance. A step onto a point without a finite value goes back to the best point with half the rate.
+    tolerance. A step onto a point without a finite value goes back to the best point with half the rate. With
+    `contexts`, a step sees only that many contexts, drawn at random; the value is then taken every 1/40 of `max_steps`
+    and at the end, and convergence is not judged before.
     """
     if tracker.problem.least_squares and tracker.start <= absolute:
         return tracker.result(name, 0, True, "the value is zero")
     parameter = torch.zeros_like(tracker.y0).requires_grad_()
     closure = _Closure(tracker, parameter, torch.ones_like(tracker.y0), 1.0)
     optimizer = torch.optim.Adam([parameter], lr=rate)
-    window = max(50, max_steps // 10)
+    window, every = max(50, max_steps // 10), max(1, max_steps // 40) if contexts > 0 else 1
+    generator = torch.Generator().manual_seed(seed)
     stall, shrink = Stall(tracker.start, window, tolerance, absolute), 1.0
     for count in range(1, max_steps + 1):
         share = 0.5 * (1 + math.cos(math.pi * (count - 1) / max_steps))
         optimizer.param_groups[0]["lr"] = shrink * (final_rate + share * (rate - final_rate))
         bad = tracker.bad
-        optimizer.step(closure)
+        if contexts > 0:
+            parameter.grad = tracker.sampled_gradient(tracker.y0 + parameter.detach(), contexts, generator)
+            optimizer.step()
+            if count % every == 0 or count == max_steps:
+                tracker.value(tracker.y0 + parameter.detach())
+        else:
+            optimizer.step(closure)
         tracker.check()
         tracker.record(count)
         if tracker.bad > bad:
             shrink *= 0.5
             optimizer.state.clear()
             with torch.no_grad():
-                parameter.copy_((tracker.best_y - tracker.y0) * closure.scale)
-        elif not bool((closure.gradient != 0).any()):
+                parameter.copy_(tracker.best_y - tracker.y0)
+        elif contexts <= 0 and not bool((closure.gradient != 0).any()):
             return tracker.result(name, count, True, "the gradient is zero")
         if tracker.problem.least_squares and tracker.best_value <= absolute:
             return tracker.result(name, count, True, "the value is zero")
-        if stall(tracker.best_value):
-            return tracker.result(
-                name, count, True, f"{window} steps lowered the value by less than {tolerance:g} of it"
-            )
+        if contexts <= 0 and stall(tracker.best_value):
+            reason = f"{window} steps lowered the value by less than {tolerance:g} of it"
+            return tracker.result(name, count, True, reason)
         if tracker.expired:
             return tracker.result(name, count, False, f"max_seconds reached ({tracker.max_seconds:g})")
     return tracker.result(name, max_steps, False, f"max_steps reached ({max_steps})")

@@ -154,6 +154,20 @@ class Tracker:
             return float("inf"), torch.zeros_like(y)
         return self._note(y, value), gradient
 
+    def sampled_gradient(self, y: Tensor, count: int, generator: torch.Generator) -> Tensor | None:
+        """A gradient [P] from `count` contexts; None where it fails. Neither counts as a value, nor as best."""
+        self.derivatives += 1
+        try:
+            value, gradient = self._ask(lambda y: self.problem.sampled_gradient(y, count, generator), y)
+            gradient = gradient.detach().to("cpu", torch.float64)
+        except BaseException as error:  # noqa: B036 - stored, and raised again by check()
+            self._fail(error)
+            return None
+        if not (abs(value) < float("inf") and bool(torch.isfinite(gradient).all())):
+            self._fail(None)
+            return None
+        return gradient
+
     def linearise(self, y: Tensor) -> tuple[float, Tensor, Tensor]:
         """Value, compressed residuals and Jacobian at `y`; inf and zeros where any fails."""
         self.derivatives += 1

@@ -69,7 +69,7 @@ def test_excess_and_largest_weight_are_of_what_is_returned():
 
 def test_quadrature_nodes_are_asked_for(monkeypatch):
     asked = []
-    module = type(sys)("dsfit.reference")
+    module = type(sys)("dsfit.quality")
 
     def quadrature_nodes(integrand, context, rtol):
         asked.append((float(context.theta_r), rtol))
@@ -77,7 +77,7 @@ def test_quadrature_nodes_are_asked_for(monkeypatch):
         return type("Nodes", (), {"omega": omega, "weight": weight, "value": integrand(omega, context)})()
 
     module.quadrature_nodes = quadrature_nodes
-    monkeypatch.setitem(sys.modules, "dsfit.reference", module)
+    monkeypatch.setitem(sys.modules, "dsfit.quality", module)
     known = truth(Toy([-0.4, 0.5]))
 
     def integrand(omega, context):
@@ -120,6 +120,72 @@ def test_batch_value_is_the_weighted_mean_however_it_is_blocked(monkeypatch):
         r, j = problem.linearise(y)
         assert float(r.square().sum()) == pytest.approx(expected, rel=1e-12) == pytest.approx(value, rel=1e-12)
         torch.testing.assert_close(2 * j.T @ r, gradient, rtol=1e-9, atol=1e-11)
+
+
+class Amortised(nn.Module):
+    """One lobe whose parameters are a function of theta_r."""
+
+    def __init__(self):
+        super().__init__()
+        generator = torch.Generator().manual_seed(0)
+        self.toy = Toy([0.0])
+        self.net = nn.Sequential(nn.Linear(2, 8), nn.Tanh(), nn.Linear(8, 4)).double()
+        with torch.no_grad():
+            for parameter in self.net.parameters():
+                parameter.copy_(0.5 * torch.randn(parameter.shape, generator=generator, dtype=torch.float64))
+        for parameter in self.toy.parameters():
+            parameter.requires_grad_(False)
+
+    def forward(self, context):
+        t = self.net(torch.stack([context.theta_r, context.theta_r**2], -1))
+        centre, width, phi, spread = (x[..., None] for x in t.unbind(-1))
+        base = self.toy(context)
+        _, *args = base.args
+        moved = [args[0] + centre, args[1] * width.exp(), args[2] + phi, args[3] * spread.exp()]
+        return type(base)(base.args[0], *moved, base.defensive)
+
+
+class Drifting(Toy):
+    def forward(self, context):
+        base = super().forward(context)
+        log_share, centre, width, phi, spread = base.args
+        t = context.theta_r[..., None]
+        return type(base)(
+            log_share, centre + 0.3 * t**2, width, phi - 0.5 * t, spread * (0.3 * t).exp(), base.defensive
+        )
+
+
+MANY = Context(torch.linspace(-1.2, 1.2, 12, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    "name, objective, options",
+    [
+        ("optimistix.lm", "excess", {}),
+        ("torch.lbfgs", "log_excess", {"max_steps": 150}),
+        ("torch.adam", "log_excess", {"contexts": 4, "max_steps": 400, "seed": 1}),
+    ],
+)
+def test_one_network_for_many_contexts(name, objective, options):
+    known = truth(Drifting([0.1]))
+    several = [nodes_of(known, MANY[i], 24) for i in range(12)]
+    result = fit(Amortised(), None, MANY, objective, name, nodes=several, **options)
+    before = fit(Amortised(), None, MANY, objective, name, nodes=several, max_steps=0)
+    assert result.excess < 0.01 < 0.5 < before.excess, result
+    assert result.excesses.shape == (12,) and float(result.excesses.max()) < 0.03
+
+
+def test_sampled_gradient_is_unbiased():
+    known, toy = truth(Toy([-0.4, 0.5])), Toy([-0.4, 0.5])
+    several = [nodes_of(known, BATCH.reshape(-1)[i], 16) for i in range(4)]
+    targets = make_targets(None, BATCH, several, 1e-4, torch.tensor([[1.0, 2.0], [3.0, 4.0]]))
+    problem = ProposalProblem(toy, targets, Excess())
+    y = problem.parameters.vector(toy)
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.stack([problem.sampled_gradient(y, 2, generator)[1] for _ in range(400)])
+    error = drawn.std(0) / 400**0.5
+    assert bool(((drawn.mean(0) - problem.gradient(y)[1]).abs() <= 4.5 * error + 1e-12).all())
+    assert torch.equal(problem.sampled_gradient(y, 4, generator)[1], problem.gradient(y)[1])
 
 
 def test_jacobian_methods_agree_and_auto_falls_back():

@@ -14,6 +14,7 @@ from dsfit.fit.objectives import (
     OBJECTIVES,
     Excess,
     ForwardKL,
+    LogExcess,
     Objective,
     Target,
     VarianceCost,
@@ -123,7 +124,7 @@ class Mean(Objective):
 
 
 @pytest.mark.parametrize(
-    "objective", [Excess(), ForwardKL(), VarianceCost(), VarianceCost(CostOfWidth(), base=0.5), Mean()]
+    "objective", [Excess(), LogExcess(), ForwardKL(), VarianceCost(), VarianceCost(CostOfWidth(), base=0.5), Mean()]
 )
 def test_gradients_against_finite_differences(objective):
     targets = [made_target(lambda v: torch.cat([v, v**2 + 0.1], -1), 0.3), made_target(None, 0.7)]
@@ -175,7 +176,7 @@ def test_cost_by_components_wants_a_mixture():
 
 
 def test_registry():
-    assert set(OBJECTIVES) == {"excess", "forward_kl", "variance_cost"}
+    assert set(OBJECTIVES) == {"excess", "log_excess", "forward_kl", "variance_cost"}
     assert objective_named("excess").name == "excess" and isinstance(objective_named(Mean()), Mean)
     with pytest.raises(InputError, match="forward_kl"):
         objective_named("chi2")

@@ -195,14 +195,15 @@ def test_same_numbers_again_and_in_threads():
     def solve(shift):
         return minimise(lambda y: rosenbrock(y - shift), vector(-1.2, 1.0), "optimistix.lm")
 
-    alone = [solve(s) for s in (0.0, 0.3, -0.2)]
+    shifts = [0.0, 0.3, -0.2, 0.7, 1.1, -0.5]
+    alone = [solve(s) for s in shifts]
     together = {}
-    threads = [threading.Thread(target=lambda s=s: together.__setitem__(s, solve(s))) for s in (0.0, 0.3, -0.2)]
+    threads = [threading.Thread(target=lambda s=s: together.__setitem__(s, solve(s))) for s in shifts]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    for shift, first in zip((0.0, 0.3, -0.2), alone, strict=True):
+    for shift, first in zip(shifts, alone, strict=True):
         assert torch.equal(first.y, together[shift].y) and first.evaluations == together[shift].evaluations
 
 
