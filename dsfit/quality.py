@@ -20,7 +20,7 @@ from dsfit.frame import cos_inclination, wrap
 from dsfit.proposals.base import Distribution, Proposal
 from dsfit.scene.integrand import Integrand
 
-_NODE_COUNT = 6
+_NODE_COUNT = 5
 
 
 @dataclass(frozen=True)
