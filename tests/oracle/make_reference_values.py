@@ -9,7 +9,7 @@ at least 1e-4 rad (`margin`) from the caustics and support edges of the raw lobe
 
     theta_i theta_r phi n v phi_h theta_diff margin
     azimuthal, scattered   {model: N_p or N^G_p at (theta_diff, phi, phi_h)}, models marschner, raw, simplified
-    mean                   E_p / (2 pi), the size of N_p and N^G_p (marschner: that of raw)
+    size_azimuthal, size_scattered   the largest N_p and N^G_p (marschner) on a grid of phi
     averages               at theta_in = theta_i, consistent;  averages_printed at theta_in = theta_diff
     consistent             {model: F cos(theta_i)}
     printed                {model: f of eqs (4)-(12)} for marschner and simplified
@@ -141,6 +141,13 @@ def fields(a: Averages) -> dict[str, np.ndarray]:
     return {name: getattr(a, name) for name in Averages.FIELDS}
 
 
+def largest(function, fiber: Fiber, p: int, theta_diff: float, phi_h: float, count: int) -> np.ndarray:
+    """Largest value per channel over a grid of phi in [0, pi]."""
+    return np.max(
+        [function(fiber, p, theta_diff, phi, "marschner", phi_h) for phi in np.linspace(0, math.pi, count)], 0
+    )
+
+
 def evaluate(fiber: Fiber, point: dict[str, float], order: int = 16) -> dict:
     g = ob.Geometry(point["theta_i"], point["theta_r"], point["phi"], point["phi_h"])
     n, v, t = point["n"], point["v"], g.theta_diff
@@ -148,7 +155,8 @@ def evaluate(fiber: Fiber, point: dict[str, float], order: int = 16) -> dict:
     return {
         "azimuthal": {m: np.array([oz.azimuthal(fiber, p, t, g.phi, m, g.phi_h) for p in lobes]) for m in oz.MODELS},
         "scattered": {m: np.array([og.scattered(fiber, p, t, g.phi, m, g.phi_h) for p in lobes]) for m in oz.MODELS},
-        "mean": np.array([oz.energy(fiber, p, t, oz.lobe_eta(fiber, p, g.phi_h)) for p in lobes]) / oz.TWO_PI,
+        "size_azimuthal": np.array([largest(oz.azimuthal, fiber, p, t, g.phi_h, 33) for p in lobes]),
+        "size_scattered": np.array([largest(og.scattered, fiber, p, t, g.phi_h, 5) for p in lobes]),
         "averages": fields(averages(fiber, g.theta_i, order=order)),
         "averages_printed": fields(averages(fiber, t, options=ob.PRINTED, order=order)),
         "consistent": {m: ob.consistent(fiber, g, n, v, m, order=order) for m in oz.MODELS},
@@ -192,7 +200,7 @@ def switches(order: int = 16) -> list[dict]:
 def plain(x, digits: int = DIGITS):
     """JSON-ready copy; floats rounded to 16 significant digits (relative error below 5e-16), sizes to 3."""
     if isinstance(x, dict):
-        return {key: plain(value, 3 if "size" in key or key == "mean" else digits) for key, value in x.items()}
+        return {key: plain(value, 3 if "size" in key else digits) for key, value in x.items()}
     if isinstance(x, (list, tuple)):
         return [plain(value, digits) for value in x]
     if isinstance(x, np.ndarray):

@@ -128,7 +128,8 @@ def theta_breaks(theta_in: float, alpha: float, beta: float, eta: float) -> list
         breaks |= {peak - 2.0 * beta * k, peak + 2.0 * beta * k}
     distance = HALF_PI - abs(theta_in)  # near grazing the geometry varies on this scale at the far end
     side = -math.copysign(HALF_PI, theta_in)
-    breaks |= {side - math.copysign(distance * k, side) for k in (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)}
+    doublings = math.ceil(math.log2(math.pi / distance))
+    breaks |= {side - math.copysign(distance * 2.0**k, side) for k in range(-2, doublings)}
     for index in KINKS:  # eta'^2 cos^2 = eta^2 - 1 + cos^2
         square = (eta * eta - 1.0) / (index * index - 1.0)
         if square < 1.0:

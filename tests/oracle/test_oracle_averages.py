@@ -119,12 +119,17 @@ def test_backscatter_sums():
     assert oa.backscatter(a_f, 1 - a_f, 0.1, 0.1, 0.1, 0.1, 0.7)[0] == pytest.approx(0.625, abs=1e-8)
 
 
-@pytest.mark.parametrize("fiber", [CHANNELS3, *ODD])
-@pytest.mark.parametrize("theta_in", [-1.5, -0.6, 0.0, 0.9])
-@pytest.mark.parametrize("options", [Options(), Options(split="half", cosine="outgoing")])
+@pytest.mark.parametrize(
+    "fiber, theta_in, options",
+    [
+        (fiber, theta_in, options)
+        for fiber in (CHANNELS3, *ODD)
+        for theta_in in (-1.5, -0.6, 0.0, 0.9)
+        for options in (Options(), Options(split="half", cosine="outgoing"))
+        if fiber.eccentricity == 1.0 or (theta_in == 0.9 and options.split == "linear")  # the slow fibre once
+    ],
+)
 def test_averages_have_converged(fiber, theta_in, options):
-    if fiber.eccentricity != 1.0 and theta_in != 0.9:
-        pytest.skip("one angle of the slow fibre is enough")
     coarse, fine = (averages(fiber, theta_in, options=options, order=order) for order in (16, 22))
     for field in coarse.FIELDS:
         scale = np.abs(getattr(fine, field)).max() if "alpha" in field or field == "delta_b" else 0.0
