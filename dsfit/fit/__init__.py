@@ -10,16 +10,19 @@ import sys
 import types
 from typing import Any
 
+from dsfit.fit.costs import Costs, measure_costs
 from dsfit.fit.fit import Fit, fit
 from dsfit.fit.objectives import OBJECTIVES, Excess, ForwardKL, LogExcess, Objective, Target, VarianceCost
 from dsfit.fit.problem import FunctionProblem, Problem, compress
 from dsfit.fit.proposal_problem import ProposalProblem
 from dsfit.fit.solvers import SOLVERS, minimise
 from dsfit.fit.tracking import HistoryEntry, SolverResult
+from dsfit.fit.transmittance import TransmittanceFit, fit_transmittance
 
 __all__ = [
     "OBJECTIVES",
     "SOLVERS",
+    "Costs",
     "Excess",
     "Fit",
     "ForwardKL",
@@ -31,9 +34,12 @@ __all__ = [
     "ProposalProblem",
     "SolverResult",
     "Target",
+    "TransmittanceFit",
     "VarianceCost",
     "compress",
     "fit",
+    "fit_transmittance",
+    "measure_costs",
     "minimise",
 ]
 

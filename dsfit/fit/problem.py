@@ -19,7 +19,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-
 TRANSFORMS = threading.RLock()
 """Held around torch.func transforms: torch's forward mode keeps its level in one variable for all threads."""
 
