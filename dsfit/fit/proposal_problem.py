@@ -74,7 +74,11 @@ class _LogDensity(nn.Module):
         super().__init__()
         self.proposal = proposal
 
-    def forward(self, context: Context, omega: Tensor) -> Tensor:
+    def forward(
+        self, context: Context, omega: Tensor, jacobian: bool = False
+    ) -> Tensor | tuple[Tensor, dict[str, Tensor]]:
+        if jacobian:
+            return self.proposal.log_prob_with_jacobian(context, omega)
         return self.proposal(context).log_prob(omega)
 
 
@@ -132,12 +136,13 @@ class ProposalProblem(Problem):
         proposal: module with `proposal(context).log_prob(omega)`, in float64; its parameters are not changed.
         targets: nodes and best densities, one per context; their shares sum to 1.
         objective: what to minimise.
-        jacobian: "reverse", "forward" or "auto".
+        jacobian: "own", "reverse", "forward" or "auto".
 
     The Jacobian of N log densities costs about as much as five evaluations by reverse mode, since each node has its
-    own scalar (`vmap(grad)` over nodes), and P + 1 by forward mode. "auto" takes reverse mode if the proposal supports
-    it and if J^T r agrees with plain autograd, which it would not if the density at one node depended on other nodes;
-    else forward mode.
+    own scalar (`vmap(grad)` over nodes), and P + 1 by forward mode. A proposal may know a faster way of its own, its
+    method `log_prob_with_jacobian`: a mixture differentiates each component in its own parameters alone. "auto" takes
+    the first of own and reverse that works and whose J^T r agrees with plain autograd (reverse mode would not if the
+    density at one node depended on other nodes); else forward mode.
     """
 
     def __init__(
@@ -211,15 +216,19 @@ class ProposalProblem(Problem):
     def linearise(self, y: Tensor) -> tuple[Tensor, Tensor]:
         if self.jacobian != "auto":
             return self._linearise(y, self.jacobian)
-        try:
-            residuals, jacobian = self._linearise(y, "reverse")
-            _, gradient = self.gradient(y)
+        own = ["own"] if hasattr(self.proposal, "log_prob_with_jacobian") else []
+        for method in (*own, "reverse"):
+            try:
+                residuals, jacobian = self._linearise(y, method)
+                _, gradient = self.gradient(y)
+            except RuntimeError:
+                continue
             ours, size = 2 * jacobian.T @ residuals, 2 * jacobian.norm(dim=0) * residuals.norm()
-            agrees = bool(((ours - gradient).abs() <= 1e-7 * size + 1e-300).all())
-        except RuntimeError:
-            agrees = False
-        self.jacobian = "reverse" if agrees else "forward"
-        return (residuals, jacobian) if agrees else self._linearise(y, "forward")
+            if bool(((ours - gradient).abs() <= 1e-7 * size + 1e-300).all()):
+                self.jacobian = method
+                return residuals, jacobian
+        self.jacobian = "forward"
+        return self._linearise(y, "forward")
 
     def _linearise(self, y: Tensor, method: str) -> tuple[Tensor, Tensor]:
         y = y.detach().to(self.device)
@@ -229,7 +238,7 @@ class ProposalProblem(Problem):
         return rows[0][0].cpu(), rows[0][1].cpu()
 
     def _context_rows(self, y: Tensor, target: Target, method: str) -> tuple[Tensor, Tensor]:
-        derivative = self._reverse if method == "reverse" else self._forward
+        derivative = {"own": self._own, "reverse": self._reverse, "forward": self._forward}[method]
         log_p, jacobian = derivative(y, target)
         leaf = log_p.detach().requires_grad_()
         with torch.enable_grad():
@@ -252,6 +261,13 @@ class ProposalProblem(Problem):
         if slope is not None:
             jacobian = jacobian + (root / (2 * factor.detach())) * residuals[:, None] * slope
         return root * residuals, jacobian
+
+    def _own(self, y: Tensor, target: Target) -> tuple[Tensor, Tensor]:
+        named = {f"proposal.{name}": value for name, value in self.parameters.split(y).items()}
+        with TRANSFORMS, _no_slow_vmap(), torch.no_grad():
+            arguments = (target.context, target.omega, True)
+            log_p, slopes = torch.func.functional_call(self.log_density, named, arguments)
+        return log_p, torch.cat([slopes[name].reshape(len(log_p), -1) for name in self.parameters.names], dim=1)
 
     def _reverse(self, y: Tensor, target: Target) -> tuple[Tensor, Tensor]:
         def one(y: Tensor, omega: Tensor) -> tuple[Tensor, Tensor]:
