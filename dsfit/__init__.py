@@ -41,9 +41,9 @@ def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"module 'dsfit' has no attribute {name!r}")
     module = importlib.import_module(_PUBLIC[name])
-    value = getattr(module, name)
-    if not (name in ("fit",) and isinstance(value, type(module))):
-        globals()[name] = value
+    # the package `dsfit.fit` can itself be called, so the name is the package wherever it was imported first
+    value = module if module.__name__ == f"{__name__}.{name}" else getattr(module, name)
+    globals()[name] = value
     return value
 
 
