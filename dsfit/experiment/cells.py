@@ -41,9 +41,12 @@ def jobs(experiment: Experiment) -> list[Job]:
     return found
 
 
+_SHOWN_ANYWAY = ("fiber.preset", "contexts.theta_r_deg", "contexts.phi_r_deg", "contexts.n", "contexts.v")
+
+
 def _label(config: Config, identity: dict[str, Any]) -> str:
     parts = [config.fiber.preset]
-    parts += [f"{key.split('.')[-1]} {value}" for key, value in identity["grid"].items() if key != "fiber.preset"]
+    parts += [f"{key.split('.')[-1]} {value}" for key, value in identity["grid"].items() if key not in _SHOWN_ANYWAY]
     context = identity["context"]
     if context:
         parts.append(f"θr {context['theta_r_deg']:g}°")

@@ -41,7 +41,8 @@ class Setting:
 
     @functools.cached_property
     def nodes(self) -> Any:
-        """Quadrature nodes of the integrand at this context; half of them where it is even, as all strategies here are."""
+        """Quadrature nodes of the integrand at this context; half of them where it is even, as all strategies here
+        are."""
         from dsfit.quality import quadrature_nodes
 
         clock = time.perf_counter()

@@ -50,7 +50,6 @@ class BsdfConfig(Section):
     d_f: Share = 0.7
     d_b: Share = 0.7
     azimuthal: Literal["marschner", "raw", "simplified"] = "marschner"
-    precision: Literal["exact", "table"] = "exact"
     convention: str | dict[str, str | int | bool] = "consistent"
     precision: Literal["auto", "exact", "table"] = "auto"
 

@@ -12,7 +12,7 @@ from dsfit.experiment.files import number
 from dsfit.experiment.plots.style import look, new_figure, short, spread
 
 MOST_PANELS = 6
-MOST_METHODS = 10
+MOST_METHODS = 8
 TARGET = 0.01
 
 
@@ -29,7 +29,7 @@ def convergence(result: dict[str, Any]) -> Figure:
     rows = math.ceil(len(chosen) / columns)
     figure = new_figure(1.2 + 3.4 * columns, 1.3 + 2.6 * rows)
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    shown = [m["name"] for m in cells[0]["methods"]][:MOST_METHODS]
+    shown = _shown(cells)
     panels = [_Panel(cells[index], shown) for index in chosen]
     limits = _limits(panels)
     handles: dict[str, Any] = {}
@@ -55,6 +55,18 @@ def convergence(result: dict[str, Any]) -> Figure:
     return figure
 
 
+def _shown(cells: list[dict[str, Any]]) -> list[str]:
+    """The methods to draw, in their order: all of them, or the first two and those that reach 1 % soonest."""
+    names = [m["name"] for m in cells[0]["methods"]]
+    if len(names) <= MOST_METHODS:
+        return names
+    seconds = [
+        np.median([number(cell["methods"][k]["seconds_to_1_percent"]) for cell in cells]) for k in range(len(names))
+    ]
+    fastest = [k for k in np.argsort(seconds) if k > 1][: MOST_METHODS - 2]
+    return [names[k] for k in sorted([0, 1, *fastest])]
+
+
 class _Panel:
     """The curves of one cell."""
 
@@ -74,8 +86,8 @@ class _Panel:
         axis.set(xscale="log", yscale="log", title=self.cell["label"], xlim=limits[:2], ylim=limits[2:])
         axis.grid(True, which="major")
         axis.axhline(TARGET, color="#555555", linestyle=":", linewidth=1)
-        for position, method in self.methods:
-            style = look(position)
+        for place, (_, method) in enumerate(self.methods):
+            style = look(place if len(self.methods) < len(self.cell["methods"]) else self.methods[place][0])
             time, error, spread_of = self.points(method)
             bars = np.stack([np.minimum(spread_of, 0.9 * error), spread_of])  # zero has no place on a log axis
             across = np.stack([time[:, 1] - time[:, 0], time[:, 2] - time[:, 1]])

@@ -11,6 +11,8 @@ from dsfit.experiment.files import number
 from dsfit.experiment.plots.style import COLORS, MARKERS, look, new_figure, short
 
 MOST_GROUPS = 8
+MOST_BARS = 8
+HIGHEST = 1e9
 FLOOR = 1e-6
 
 
@@ -21,9 +23,10 @@ def _table(result: dict[str, Any]) -> tuple[list[str], np.ndarray]:
 
 
 def _ends(values: np.ndarray) -> tuple[float, float]:
-    """Ends of a logarithmic axis for the finite values; infinite ones end at its top."""
+    """Ends of a logarithmic axis for the values; infinite and huge ones end at its top."""
     finite = values[np.isfinite(values)]
-    return 10 ** np.floor(np.log10(finite.min()) - 0.3), 10 ** np.ceil(np.log10(finite.max()) + 0.3)
+    low, high = np.log10(finite.min()), np.log10(min(finite.max(), HIGHEST))
+    return 10 ** np.floor(low - 0.3), 10 ** np.ceil(high + 0.3)
 
 
 def excess_bars(result: dict[str, Any]) -> Figure:
@@ -31,7 +34,7 @@ def excess_bars(result: dict[str, Any]) -> Figure:
     and the median."""
     names, values = _table(result)
     cells = result["cells"]
-    if len(cells) > MOST_GROUPS:
+    if len(cells) > MOST_GROUPS or len(names) > MOST_BARS:
         return _dots(result, names, values)
     figure = new_figure(
         1.6 + max(4.5, 0.17 * len(names) * len(cells) + 0.5 * len(cells)), 3.4 + 0.2 * (len(names) // 3)
@@ -53,8 +56,8 @@ def excess_bars(result: dict[str, Any]) -> Figure:
             edgecolor="white",
             linewidth=0.3,
         )
-    for text, where, at in (("< 0", values <= FLOOR, FLOOR), ("∞", np.isinf(values), top)):
-        for k, index in zip(*np.nonzero(where), strict=True):
+    for text, where, at in (("< 0", values <= FLOOR, FLOOR), ("∞", values > top, top)):
+        for k, index in np.argwhere(where):
             x = k + (index - (len(names) - 1) / 2) * width
             axis.text(x, at, text, fontsize=7, ha="center", va="bottom")
     axis.set(yscale="log", ylabel="excess  M(p) / M* − 1", ylim=(bottom, top * 3))
@@ -68,13 +71,16 @@ def excess_bars(result: dict[str, Any]) -> Figure:
 def _dots(result: dict[str, Any], names: list[str], values: np.ndarray) -> Figure:
     figure = new_figure(7.2, 1.4 + 0.34 * len(names))
     axis = figure.subplots()
-    values = np.minimum(values, _ends(values)[1])
+    top = _ends(values)[1]
+    note = "; right end: more, or infinite" if (values > top).any() else ""
+    note += "; left end: less, or negative" if (values <= FLOOR).any() else ""
+    values = np.minimum(values, top)
     shift = np.linspace(-0.28, 0.28, len(values))
     for index in range(len(names)):
         style = look(index)
-        axis.scatter(values[:, index], index + shift, s=11, linewidths=0, alpha=0.8, **style)
+        axis.scatter(values[:, index], index + shift, s=14, linewidths=0, zorder=3, alpha=0.8, **style)
         axis.plot([np.median(values[:, index])] * 2, [index - 0.4, index + 0.4], color="black", linewidth=1.4)
-    axis.set(xscale="log", xlabel="excess  M(p) / M* − 1  (line: median)", ylim=(len(names) - 0.5, -0.5))
+    axis.set(xscale="log", xlabel=f"excess  M(p) / M* − 1  (line: median{note})", ylim=(len(names) - 0.5, -0.5))
     axis.set_yticks(range(len(names)), [short(name, 34) for name in names])
     axis.grid(True, axis="x")
     figure.suptitle(f"Distance from the best possible density, {len(values)} contexts", fontsize=10)

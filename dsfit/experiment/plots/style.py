@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from dsfit.experiment.files import write_bytes
 
-# Okabe and Ito's palette without its yellow, which is too light for lines on white.
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+# Okabe and Ito's palette with grey for its yellow, which is too light for lines on white.
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "#8C8C8C")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
 
 _RC: dict[str, Any] = {
