@@ -94,7 +94,7 @@ def check(
 def check_averages(found: dsfit.Averages, expected: dict[str, Tensor]) -> None:
     """All averages; angles can cancel and are measured against their largest value over points and channels.
 
-    A_b and Delta_b have a pole at a_f = 1, crossed only without the energy limit: 1e-9 in a_f is 1e-9 / |1 - a_f| there.
+    A_b and Delta_b have a pole at a_f = 1, crossed only without the energy limit: 1e-9 in a_f means 1e-9 / |1 - a_f|.
     """
     for field in AVERAGES:
         value = expected[field]
