@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from dsfit.context import Context
-from dsfit.errors import InputError
+from dsfit.errors import InputError, check_choice
 from dsfit.fit.objectives import Objective, Target, excess_residuals, objective_named
 from dsfit.fit.proposal_problem import Parameters, ProposalProblem
 from dsfit.fit.solvers import minimise, solver_named
@@ -106,7 +106,7 @@ def fit(
         weights: positive weights of the contexts in the mean, of the batch's shape.
         max_steps, tolerance: see `minimise`.
         max_seconds: wall time for all starts together.
-        jacobian: "auto", "reverse" or "forward"; see `ProposalProblem`.
+        jacobian: "auto", "own", "reverse" or "forward"; see `ProposalProblem`.
         options: further options of the solver.
 
     Raises:
@@ -116,8 +116,8 @@ def fit(
     began = time.perf_counter()
     if starts < 1:
         raise InputError("starts", starts, "integers >= 1")
-    if jacobian not in ("auto", "reverse", "forward"):
-        raise InputError("jacobian", jacobian, "one of 'auto', 'reverse', 'forward'")
+    methods = ("auto", "reverse", "forward", *(["own"] if hasattr(proposal, "log_prob_with_jacobian") else []))
+    check_choice("jacobian", jacobian, methods)
     objective = objective_named(objective)
     defaults = {
         key: value for key, value in NATURAL.items() if key in solver_named(solver, objective.least_squares).options

@@ -234,6 +234,44 @@ def test_jacobian_methods_agree_and_auto_falls_back():
         torch.testing.assert_close(2 * j.T @ r, problem.gradient(y)[1], rtol=1e-9, atol=1e-11)
 
 
+@pytest.mark.parametrize("tied", [False, True])
+@pytest.mark.parametrize("defensive", [0.0, 0.05])
+def test_a_mixtures_own_jacobian_agrees_with_the_others_or_is_not_used(defensive, tied):
+    from dsfit.proposals.azimuth import CosineHalf, WrappedGaussian
+    from dsfit.proposals.base import Product
+    from dsfit.proposals.gaussian_lobe import GaussianLobe
+    from dsfit.proposals.mixture import Mixture
+
+    parts = [Product(GaussianLobe(-0.2, 0.2), WrappedGaussian(0.6)), Product(GaussianLobe(0.3, 0.4), CosineHalf())]
+    third = parts[0] if tied else Product(GaussianLobe(0.0, 0.3), WrappedGaussian(1.0))
+    mixture = Mixture([*parts, third], [0.5, 0.3, 0.2], defensive)
+    target = make_targets(None, ONE, NODES, 1e-4, None)[0]
+    own, reverse, forward, auto = (
+        ProposalProblem(mixture, [target], Excess(), jacobian=m) for m in ("own", "reverse", "forward", "auto")
+    )
+    y = own.parameters.vector(mixture)
+    (r1, j1), (r2, j2), (r3, j3) = own.linearise(y), reverse.linearise(y), forward.linearise(y)
+    ra, ja = auto.linearise(y)
+    if not tied:
+        assert auto.jacobian == "own"
+    for r, j in ((r2, j2), (r3, j3), (ra, ja), *(() if tied else ((r1, j1),))):
+        torch.testing.assert_close(j2.T @ j2, j.T @ j, rtol=1e-9, atol=1e-10)
+        torch.testing.assert_close(j2.T @ r2, j.T @ r, rtol=1e-9, atol=1e-10)
+
+
+def test_an_own_jacobian_that_is_wrong_is_not_used():
+    class Wrong(Toy):
+        def log_prob_with_jacobian(self, context, omega):
+            log_p = self(context).log_prob(omega)
+            return log_p, {name: torch.ones(len(log_p), *p.shape).double() for name, p in self.named_parameters()}
+
+    problem = ProposalProblem(Wrong([-0.4, 0.5]), make_targets(None, ONE, NODES, 1e-4, None), Excess())
+    y = problem.parameters.vector(problem.proposal)
+    r, j = problem.linearise(y)
+    assert problem.jacobian == "reverse"
+    torch.testing.assert_close(2 * j.T @ r, problem.gradient(y)[1], rtol=1e-9, atol=1e-11)
+
+
 def test_multi_start_is_deterministic_and_keeps_the_best():
     # From the far side of the circle one start alone fails.
     toy = Toy([-0.4, 0.5])
@@ -292,6 +330,7 @@ def test_bad_input():
         (lambda: fit(toy, None, ONE, solver="newton", nodes=NODES), "solver"),
         (lambda: fit(toy, None, ONE, nodes=NODES, starts=0), "starts"),
         (lambda: fit(toy, None, ONE, nodes=NODES, jacobian="both"), "jacobian"),
+        (lambda: fit(toy, None, ONE, nodes=NODES, jacobian="own"), "jacobian"),
         (lambda: fit(toy, None, ONE, nodes=NODES, rate=1.0), "options"),
         (lambda: fit(toy, None, ONE), "integrand"),
         (lambda: fit(toy, None, BATCH, nodes=[NODES]), "nodes"),
