@@ -1,7 +1,7 @@
 """dsfit: Monte Carlo rendering of hair that converges faster.
 
-Differentiable dual scattering BSDF, proposal densities, multiple importance sampling, and fits of the proposals to a reference
-integrand. See the README for a tour; the names below are the public contract.
+Differentiable dual scattering BSDF, proposal densities, multiple importance sampling, and fits of the proposals to a
+reference integrand. See the README for a tour; the names below are the public contract.
 """
 
 from __future__ import annotations

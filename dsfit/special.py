@@ -166,6 +166,16 @@ def log_normal_mass(a: Tensor, b: Tensor) -> Tensor:
     return log_window(a, b) - 0.5 * c * c - LOG_SQRT_2PI
 
 
+def normal_mass(a: Tensor, b: Tensor) -> Tensor:
+    """`Phi(b) - Phi(a)` for a <= b, from the smaller tails by erfc, so that float32 keeps its digits in the tails too.
+
+    `torch.special.ndtr` returns 0 in float32 from 5.5 standard deviations on.
+    """
+    flip = a > 0
+    low, high = torch.where(flip, -b, a), torch.where(flip, -a, b)
+    return 0.5 * (torch.special.erfc(-high * _ROOT_HALF) - torch.special.erfc(-low * _ROOT_HALF))
+
+
 def truncated_normal_log_density(x: Tensor, mean: Tensor, std: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """`truncated_normal_log_prob` for x known to be in [low, high]."""
     reference = torch.minimum(torch.maximum(mean, low), high)

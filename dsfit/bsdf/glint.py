@@ -14,7 +14,7 @@ from dsfit.bsdf.attenuation import Absorption, caustic_attenuation
 from dsfit.bsdf.fiber import Fiber
 from dsfit.bsdf.snell import Caustic, Refraction, cos_refracted
 from dsfit.frame import wrap
-from dsfit.special import log_gauss
+from dsfit.special import log_gauss, normal_mass
 
 
 @dataclass(frozen=True)
@@ -74,12 +74,6 @@ def _window_mass(distance: Tensor, width: Tensor) -> Tensor:
     high = d + math.pi / 2
     reach = high.clamp_max(math.pi)
     crossed = (high - 2 * math.pi).clamp_min(-math.pi)
-    mass = _normal_mass((d - math.pi / 2) / width, reach / width)
-    return mass + _normal_mass(torch.full_like(d, -math.pi) / width, crossed / width)
+    mass = normal_mass((d - math.pi / 2) / width, reach / width)
+    return mass + normal_mass(torch.full_like(d, -math.pi) / width, crossed / width)
 
-
-def _normal_mass(a: Tensor, b: Tensor) -> Tensor:
-    """Phi(b) - Phi(a) for a <= b, by the smaller tail."""
-    flip = a > 0
-    low, high = torch.where(flip, -b, a), torch.where(flip, -a, b)
-    return torch.special.ndtr(high) - torch.special.ndtr(low)

@@ -12,7 +12,7 @@ from dsfit.bsdf.fiber import Fiber
 from dsfit.bsdf.glint import Glint
 from dsfit.bsdf.snell import Caustic, Refraction, exit_trt, gamma_tt, root_falling, root_rising
 from dsfit.frame import HALF_PI, wrap
-from dsfit.special import wrapped_normal_log_prob
+from dsfit.special import normal_mass
 
 _SERIES = 4
 
@@ -143,9 +143,7 @@ def wrapped_window(distance: Tensor, width: Tensor) -> Tensor:
     for k in range(-_SERIES, _SERIES + 1):
         center = distance + 2 * math.pi * k
         a, b = (center - HALF_PI) / safe, (center + HALF_PI) / safe
-        flip = a > 0
-        low, high = torch.where(flip, -b, a), torch.where(flip, -a, b)
-        images = images + torch.special.ndtr(high) - torch.special.ndtr(low)
+        images = images + normal_mass(a, b)
     broad = torch.where(narrow, 2.0, width)
     series: Tensor | float = 0.5
     for k in range(1, 2 * _SERIES, 2):
@@ -153,5 +151,3 @@ def wrapped_window(distance: Tensor, width: Tensor) -> Tensor:
         series = series + sign * torch.exp(-0.5 * (k * broad) ** 2) * torch.cos(k * distance) * (2 / (math.pi * k))
     return torch.where(narrow, images, series)
 
-
-__all__ = ["offset_windows", "simplified_windows", "wrapped_normal_log_prob", "wrapped_window"]

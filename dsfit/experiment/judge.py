@@ -21,8 +21,6 @@ RTOL = 1e-3
 FLOOR = 1e-4
 """Excess below this is resolved to RTOL times this, not to RTOL."""
 MAX_EVALUATIONS = 1_000_000
-DIVERGED = 0.02
-"""An error bound above this, relative to the second moment, after MAX_EVALUATIONS means an integral that diverges."""
 
 
 def judge(plans: Sequence[Plan], setting: Setting, reference: Any) -> list[dict[str, float]]:
@@ -35,8 +33,9 @@ def judge(plans: Sequence[Plan], setting: Setting, reference: Any) -> list[dict[
     the last integral is 0 for the balance heuristic and a single proposal. What fixed sample counts per strategy gain
     is subtracted; it comes from the nodes. For the optimal heuristic, alpha comes from the nodes and the variance
     with that alpha, `∫ |F - alpha.p|^2 / P`, is what counts; its excess, (N Var + |I|^2) / M* - 1, can be negative.
-    All integrals are adaptive, over half the azimuth where F is even. A method without density somewhere where F is
-    not 0 is biased; its excess is inf, as is that of one whose second moment diverges (p falls to 0 where F does not).
+    All integrals are adaptive, over half the azimuth where F is even. The excess is inf for a method without density
+    somewhere where F is not 0 (it is biased) and where its density falls to 0 at phi = pi, as cos(phi/2) does, but F
+    does not: then ∫ F^2 / P diverges.
     """
     judged = {id(plan): _NOTHING for plan in plans}
     sound = [plan for plan in plans if _covers(plan, setting)]
@@ -92,8 +91,6 @@ def _integrate(plans: list[Plan], setting: Setting, reference: Any) -> dict[int,
         elif plan.model == "multi":
             excess -= float(nodes.excess - nodes.variance_excess)
         error = float(found.error[k]) * units[k]
-        if error > DIVERGED * (1 + abs(excess)):
-            excess = math.inf
         judged[id(plan)] = {
             "excess": excess,
             "excess_error": error,
@@ -104,22 +101,32 @@ def _integrate(plans: list[Plan], setting: Setting, reference: Any) -> dict[int,
 
 
 def _covers(plan: Plan, setting: Setting) -> bool:
-    """Whether some strategy has density wherever F is not 0; otherwise the estimate is biased."""
-    alive = (setting.log_p(plan.strategies) > -torch.inf).any(dim=0)
-    return bool((alive | (setting.nodes.norm == 0)).all())
+    """Whether the density is positive wherever F is, as far as the nodes and the edge phi = pi tell."""
+    log_p = setting.log_p(plan.strategies)
+    alive = (log_p > -torch.inf).any(dim=0)
+    if not bool((alive | (setting.nodes.norm == 0)).all()):
+        return False
+    context = setting.context
+    theta = torch.linspace(-1.5, 1.5, 31, dtype=torch.float64)
+    edge = torch.stack([theta, wrap(context.phi_r - math.pi).expand_as(theta)], dim=-1)
+    beside = edge + torch.tensor([0.0, 0.1], dtype=torch.float64)
+    with torch.no_grad():
+        vanishes = plan.density(edge, context) < 1e-12 * plan.density(beside, context)
+        lit = torch.linalg.vector_norm(setting.integrand(edge, context), dim=-1) > 0
+    return not bool((vanishes & lit).any())
 
 
 def _from_nodes(plan: Plan, setting: Setting) -> MisVariance:
-    nodes = setting.nodes
+    nodes = setting.fine_nodes
     with torch.no_grad():
-        log_p = setting.log_p(plan.strategies)
+        log_p = setting.log_p(plan.strategies, nodes)
         counts = torch.tensor(plan.fractions, dtype=log_p.dtype)
         return mis_variance(nodes.value, nodes.weight, log_p, counts, plan.heuristic, model=plan.model)
 
 
 def _alpha(plan: Plan, setting: Setting) -> Tensor:
     """Coefficients `[S, C]` of the optimal heuristic from the nodes."""
-    nodes, log_p = setting.nodes, setting.log_p(plan.strategies)
+    nodes, log_p = setting.fine_nodes, setting.log_p(plan.strategies, setting.fine_nodes)
     fractions = torch.tensor(plan.fractions, dtype=log_p.dtype)
     mix = torch.exp(torch.logsumexp(log_effective(log_p, fractions), dim=0))
     return quadrature_alpha(

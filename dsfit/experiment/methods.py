@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from dsfit.experiment.reader import ConfigError, RawConfig
 
 NODE_RTOL = 1e-3
+FINE_RTOL, FINE_COUNT = 1e-5, 8
 
 
 class Setting:
@@ -50,6 +51,13 @@ class Setting:
         self.nodes_seconds = time.perf_counter() - clock
         return found
 
+    @functools.cached_property
+    def fine_nodes(self) -> Any:
+        """More nodes, for judging what was fitted on the others."""
+        from dsfit.quality import quadrature_nodes
+
+        return quadrature_nodes(self.integrand, self.context, rtol=FINE_RTOL, even=True, count=FINE_COUNT)
+
     def distribution(self, strategy: nn.Module) -> Any:
         """The strategy's distribution at this context; made once."""
         if id(strategy) not in self._distributions:
@@ -57,10 +65,11 @@ class Setting:
                 self._distributions[id(strategy)] = (strategy, strategy(self.context))
         return self._distributions[id(strategy)][1]
 
-    def log_p(self, strategies: Sequence[nn.Module]) -> Tensor:
-        """Log densities `[S, Q]` at the nodes."""
+    def log_p(self, strategies: Sequence[nn.Module], nodes: Any = None) -> Tensor:
+        """Log densities `[S, Q]` at the nodes (those of the fit unless others are given)."""
+        omega = (self.nodes if nodes is None else nodes).omega
         with torch.no_grad():
-            return torch.stack([self.distribution(s).log_prob(self.nodes.omega) for s in strategies])
+            return torch.stack([self.distribution(s).log_prob(omega) for s in strategies])
 
 
 @dataclass

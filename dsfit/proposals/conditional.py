@@ -47,7 +47,8 @@ class ConditionalAzimuth(AzimuthalDistribution):
         x = (position - column).clamp(0, 1)
         table, width = self.density.flatten(), columns + 1
         at = row * width + column
-        corners = [torch.take(table, at + k) for k in (0, 1, width, width + 1)]  # works on scalars under vmap too
+        index = at.reshape(-1)  # one dimension even for scalars: vmap has a rule for that
+        corners = [table[index + k].reshape(at.shape) for k in (0, 1, width, width + 1)]
         lower, upper = torch.lerp(corners[0], corners[1], x), torch.lerp(corners[2], corners[3], x)
         density = torch.lerp(lower, upper, share.expand_as(lower)) / 2
         empty = density <= 0
