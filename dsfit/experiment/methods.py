@@ -187,9 +187,12 @@ def _fitted(method: FittedMethod, setting: Setting) -> Plan:
     from dsfit.fit.fit import fit
     from dsfit.fit.optimistix_solvers import least_squares  # noqa: F401  (importing JAX is not part of the fit)
     from dsfit.proposals.structured import StructuredProposal
+    from dsfit.scene import ConstantLight
 
     nodes, clock = setting.nodes, time.perf_counter()
-    start = StructuredProposal(setting.integrand.bsdf, setting.context, method.defensive)
+    light = setting.integrand.light
+    extra = {} if isinstance(light, ConstantLight) else {"light": light.proposal()}
+    start = StructuredProposal(setting.integrand.bsdf, setting.context, method.defensive, extra=extra)
     start_seconds = time.perf_counter() - clock
     if method.max_steps == 0:
         return Plan([start.requires_grad_(False)], [method.family], fit={"seconds": start_seconds})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import weakref
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -50,9 +51,21 @@ class StructuredProposal(Mixture):
         context: the context it starts from; of a batch, the mean is taken.
         defensive: share of the uniform sphere; bounds every weight by 4 pi |f| / defensive.
         broad: initial share of the broad lobe.
+        extra: further proposals by name that the mixture takes in, such as `{"light": light.proposal()}`, each starting
+            with `extra_share`.
+        extra_share: initial share of each of them.
     """
 
-    def __init__(self, bsdf: DualScattering, context: Context, defensive: float = 0.001, broad: float = 0.01) -> None:
+    def __init__(
+        self,
+        bsdf: DualScattering,
+        context: Context,
+        defensive: float = 0.001,
+        broad: float = 0.01,
+        *,
+        extra: Mapping[str, Proposal] | None = None,
+        extra_share: float = 0.2,
+    ) -> None:
         with torch.no_grad():
             parts = _Start(bsdf, context.reshape(-1).to(torch.float64)).components()
         names = [name for name, _, _ in parts]
@@ -60,8 +73,10 @@ class StructuredProposal(Mixture):
         floor = 1e-4
         weights = [floor + (1 - broad) * energy / total for _, energy, _ in parts]
         wide = Product(SplitGaussianLobe(0.0, 0.6, 0.6), UniformAzimuth())
-        super().__init__([*(p for _, _, p in parts), wide], [*weights, broad], defensive)
-        self.names = (*names, "broad")
+        added = dict(extra or {})
+        components = [*(p for _, _, p in parts), wide, *added.values()]
+        super().__init__(components, [*weights, broad, *(extra_share for _ in added)], defensive)
+        self.names = (*names, "broad", *added)
 
 
 class _Start:
