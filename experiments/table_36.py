@@ -3,7 +3,8 @@
     dsfit run configs/bench_36.toml
     python experiments/table_36.py runs/bench_36-ID [TABLE.md]
 
-Reads the run's result.json and computes nothing but ratios. Left out, TABLE.md is table_contexts.md in the run directory.
+Reads the run's result.json and computes nothing but ratios. TABLE.md is table_contexts.md in the run directory, if left
+out.
 """
 
 from __future__ import annotations
