@@ -33,12 +33,13 @@ class Setting:
         self._distributions: dict[int, tuple[nn.Module, Any]] = {}
 
     @functools.cached_property
-    def chapter(self) -> dict[str, nn.Module]:
-        """The chapter's proposals for this fibre, by name."""
+    def proposals(self) -> dict[str, nn.Module]:
+        """The chapter's proposals for this fibre and the light's, by name."""
         from dsfit.proposals import chapter_proposals
 
         bsdf = self.integrand.bsdf
-        return chapter_proposals(bsdf, back_azimuth=bsdf.convention.back_azimuth, learnable=False)
+        found = dict(chapter_proposals(bsdf, back_azimuth=bsdf.convention.back_azimuth, learnable=False))
+        return {**found, "light": self.integrand.light.proposal()}
 
     @functools.cached_property
     def nodes(self) -> Any:
@@ -127,9 +128,9 @@ class Plan:
 def make_plan(method: Any, setting: Setting) -> Plan:
     """The plan of a method at this context; fits it if it is one."""
     if method.kind == "uniform":
-        return Plan([setting.chapter["uniform"]], ["uniform"])
+        return Plan([setting.proposals["uniform"]], ["uniform"])
     if method.kind == "light":
-        return Plan([setting.integrand.light.proposal()], ["light"])
+        return Plan([setting.proposals["light"]], ["light"])
     if method.kind == "single":
         return _single(method, setting)
     if method.kind == "heuristic_mix":
@@ -138,10 +139,10 @@ def make_plan(method: Any, setting: Setting) -> Plan:
 
 
 def _single(method: SingleMethod, setting: Setting) -> Plan:
-    proposal = setting.chapter[method.proposal]
+    proposal = setting.proposals[method.proposal]
     if not method.defensive:
         return Plan([proposal], [method.proposal])
-    uniform = setting.chapter["uniform"]
+    uniform = setting.proposals["uniform"]
     return Plan(
         [proposal, uniform],
         [method.proposal, "uniform"],
@@ -152,8 +153,8 @@ def _single(method: SingleMethod, setting: Setting) -> Plan:
 
 
 def _mix(method: HeuristicMixMethod, setting: Setting) -> Plan:
-    names = list(chapter_names()) if method.proposals == "chapter" else list(method.proposals)
-    strategies = [setting.chapter[name] for name in names]
+    names = mix_names(method)
+    strategies = [setting.proposals[name] for name in names]
     if method.weights == "best":
         from dsfit.experiment.heuristic_mix import best_mix
 
@@ -229,11 +230,11 @@ def check_method(raw: RawConfig, index: int, method: Any) -> None:
     def refuse(key: tuple[str | int, ...], allowed: str) -> ConfigError:
         return raw.error(("methods", index, *key), allowed)
 
-    names = chapter_names()
+    names = (*chapter_names(), "light")
     if isinstance(method, SingleMethod) and method.proposal not in names:
         raise refuse(("proposal",), "one of " + ", ".join(names) + did_you_mean(method.proposal, names))
     if isinstance(method, HeuristicMixMethod):
-        chosen = list(names) if method.proposals == "chapter" else method.proposals
+        chosen = mix_names(method)
         for k, name in enumerate(chosen):
             if name not in names:
                 raise refuse(("proposals", k), "one of " + ", ".join(names) + did_you_mean(name, names))
@@ -256,6 +257,13 @@ def check_method(raw: RawConfig, index: int, method: Any) -> None:
             solver_named(method.solver)
         except InputError as error:
             raise refuse(("solver",), error.allowed) from None
+
+
+def mix_names(method: HeuristicMixMethod) -> list[str]:
+    """Names of the proposals that a mix is made of."""
+    if isinstance(method.proposals, list):
+        return list(method.proposals)
+    return [*chapter_names(), *(["light"] if method.proposals == "all" else [])]
 
 
 @functools.cache

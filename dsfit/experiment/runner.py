@@ -56,6 +56,11 @@ class NoProgress:
         """Nothing."""
 
 
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What `run` returns: where the run is, its result, and whether it was there already."""
@@ -109,7 +114,7 @@ def run(
         todo = jobs(experiment)
         done = {job.index for job in todo if directory.cell(job.index, job.identity) is not None}
         pending = [job for job in todo if job.index not in done]
-        workers = (os.cpu_count() or 1) if workers is None else workers
+        workers = cores() if workers is None else workers
         workers = min(workers, len(pending))
         session = {"started": started, "workers": workers, "threads_per_worker": 1, "cells_reused": len(done)}
         record = {

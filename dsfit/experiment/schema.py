@@ -164,14 +164,15 @@ class SingleMethod(Method):
 
 
 class HeuristicMixMethod(Method):
-    """Several proposals of the chapter combined by multiple importance sampling.
+    """Several proposals combined by multiple importance sampling: those of the chapter, "all" (the light's too) or a
+    list.
 
     `weights` are shares of the samples: "equal", a list, or "best": optimised on quadrature nodes, over both models.
     `heuristic` left out is balance, or, with "best", the best of all but "optimal".
     """
 
     kind: Literal["heuristic_mix"]
-    proposals: Annotated[list[str], Field(min_length=1)] | Literal["chapter"] = "chapter"
+    proposals: Annotated[list[str], Field(min_length=1)] | Literal["chapter", "all"] = "chapter"
     weights: Literal["equal", "best"] | Annotated[list[NonNegative], Field(min_length=1)] = "equal"
     heuristic: HeuristicName | dict[str, str | float] | None = None
     model: Literal["multi", "one"] = "multi"

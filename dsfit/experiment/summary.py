@@ -201,10 +201,11 @@ def caption(result: dict[str, Any]) -> str:
     """What the numbers are, in words."""
     estimate = result["config"]["estimate"]
     session = (result.get("provenance", {}).get("sessions") or [{}])[-1]
+    workers = session.get("workers") or 1
     lines = [
         "Medians over the contexts, worst where it says so. Excess by quadrature: 0 is the limit of any density. "
         "Weights in units of their mean.",
-        f"Times: {estimate['dtype']}, one thread per process, {session.get('workers', '?')} processes at once, "
+        f"Times: {estimate['dtype']}, one thread per process, {workers} at once, "
         f"{estimate['repeats']} estimates in one batch; time to a relative RMSE of 1 %.",
     ]
     for row in rows(result["cells"]):

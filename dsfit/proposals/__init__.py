@@ -9,6 +9,7 @@ from dsfit.proposals.conditional import FiberAzimuth, lobe_azimuths
 from dsfit.proposals.gaussian_lobe import BoxMullerLobe, GaussianLobe
 from dsfit.proposals.lobe import Lobe
 from dsfit.proposals.mixture import Mixture, MixtureDistribution
+from dsfit.proposals.offset_azimuth import OffsetAzimuth
 from dsfit.proposals.scattered_lobe import BackScatterLobe, ScatteredLobe
 from dsfit.proposals.split_lobe import SplitGaussianLobe
 from dsfit.proposals.structured import StructuredProposal
@@ -40,6 +41,7 @@ __all__ = [
     "Longitudinal",
     "Mixture",
     "MixtureDistribution",
+    "OffsetAzimuth",
     "Product",
     "Proposal",
     "Scattered",

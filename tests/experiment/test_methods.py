@@ -73,6 +73,16 @@ def test_every_method_becomes_a_plan_and_is_judged_as_the_library_judges_it() ->
     assert judged[5]["excess"] > judged[4]["excess"] > judged[6]["excess"]
 
 
+def test_all_is_the_chapter_and_the_light() -> None:
+    lobes = {"kind": "lobes", "lobes": [{"theta_deg": 20, "phi_deg": 100, "width_deg": 3}], "ambient": 0.1}
+    mix = {"kind": "heuristic_mix", "weights": "best"}
+    place = setting(named({"kind": "light"}, mix, {**mix, "proposals": "all"}), light=lobes)
+    found = plans(place)
+    light, chapter, both = judge(found, place, reference(place.integrand, place.context, rtol=1e-4))
+    assert "light" in found[2].names and "light" not in found[1].names
+    assert both["excess"] < min(light["excess"], chapter["excess"])
+
+
 def test_methods_that_miss_a_part_or_diverge_are_infinitely_bad() -> None:
     place = setting(
         named({"kind": "single", "proposal": "front"}, {"kind": "single", "proposal": "R"}, {"kind": "uniform"})
@@ -98,7 +108,7 @@ def test_balance_fractions_are_optimal_by_their_own_proof() -> None:
 
 def test_the_best_mix_is_not_worse_than_any_mix_by_hand() -> None:
     place = setting(named({"kind": "uniform"}), n=2.0)
-    strategies = [place.chapter[name] for name in chapter_names()]
+    strategies = [place.proposals[name] for name in chapter_names()]
     best = best_mix(place, strategies)
     assert best.excess == min(best.tried.values()) and sum(best.fractions) == pytest.approx(1)
     log_p = place.log_p(strategies)

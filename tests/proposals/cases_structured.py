@@ -8,7 +8,7 @@ import math
 import torch
 
 import dsfit
-from dsfit.proposals import FiberAzimuth, Product, SplitGaussianLobe, StructuredProposal, UniformAzimuth
+from dsfit.proposals import FiberAzimuth, OffsetAzimuth, Product, SplitGaussianLobe, StructuredProposal, UniformAzimuth
 from dsfit.proposals.base import Proposal
 from dsfit.proposals.structured import azimuth_tables
 from tests.proposals.cases import DEG, Case, Peak
@@ -41,6 +41,10 @@ def _azimuth(scattered: bool, k: int):  # noqa: ANN202
     return build
 
 
+def _offset(lobe: str, mode: float = 0.05, width: float = 0.15):  # noqa: ANN202
+    return lambda: Product(SplitGaussianLobe(mode, width, width), OffsetAzimuth(lobe, 1.55))
+
+
 def _dark_row() -> Proposal:
     """A table with a row without any light, which becomes uniform."""
     rows = torch.rand(9, 13, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
@@ -71,6 +75,7 @@ CASES = [
         for s in (False, True)
         for k, name in enumerate(("R", "TT", "TRT"))
     ),
+    Case("offset azimuth R", _offset("R"), _peaks((0.05, 0.15))),
     Case("azimuth with a dark row", _dark_row, _peaks((0.0, 0.3)), phi_breaks=_COARSE),
     Case("structured direct", _structured(0.0), _LOBES, phi_breaks=_NODES, one_to_one=False, n=0.0),
     Case("structured scattered", _structured(3.0), _LOBES, phi_breaks=_NODES, one_to_one=False),
