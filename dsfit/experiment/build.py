@@ -3,9 +3,12 @@ radians."""
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
+import os
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -86,9 +89,26 @@ def scattering(config: Config) -> Scattering | None:
 
 
 def integrand(config: Config, dtype: torch.dtype = torch.float64) -> Any:
-    """BSDF x light x scattering."""
+    """BSDF x light x scattering; the last few are kept, because the BSDF's tables take a second to make."""
+    scene = config.model_dump_json(include={"fiber", "bsdf", "light", "scattering"})
+    path = getattr(config.light, "path", None)
+    status = os.stat(path) if path and os.path.exists(path) else None
+    return _integrand(_Scene(config, (scene, status and (status.st_mtime_ns, status.st_size))), dtype)
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """A config that equals another if their scenes do."""
+
+    config: Config = field(compare=False)
+    key: tuple[Any, ...]
+
+
+@functools.lru_cache(maxsize=4)
+def _integrand(scene: _Scene, dtype: torch.dtype) -> Any:
     from dsfit.scene.integrand import Integrand
 
+    config = scene.config
     return Integrand(bsdf(config, dtype), light=light(config), scattering=scattering(config))
 
 

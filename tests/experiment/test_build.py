@@ -96,3 +96,16 @@ def test_tables_are_taken_where_they_are_right() -> None:
     assert build.bsdf(config()).precision == "table"
     assert build.bsdf(config(fiber={"eccentricity": 0.9})).precision == "exact"
     assert build.bsdf(config(bsdf={"precision": "exact"})).precision == "exact"
+
+
+def test_scenes_are_kept_until_they_change(tmp_path: Path) -> None:
+    def make(**data: Any) -> Any:
+        return build.integrand(config(**data))
+
+    assert make() is make(contexts={"n": [5]}) and make() is not make(fiber={"eta": 1.5})
+    sky = {"kind": "environment", "path": str(tmp_path / "sky.exr")}
+    write_exr(sky["path"], {"RGB": torch.ones(4, 8, 3)})
+    before = make(light=sky)
+    assert make(light=sky) is before
+    write_exr(sky["path"], {"RGB": torch.ones(8, 16, 3)})
+    assert make(light=sky) is not before
