@@ -72,15 +72,15 @@ def _dots(result: dict[str, Any], names: list[str], values: np.ndarray) -> Figur
     figure = new_figure(7.2, 1.4 + 0.34 * len(names))
     axis = figure.subplots()
     top = _ends(values)[1]
-    note = "; right end: more, or infinite" if (values > top).any() else ""
-    note += "; left end: less, or negative" if (values <= FLOOR).any() else ""
+    note = "\nright end: more, or infinite" if (values > top).any() else ""
+    note += "\nleft end: less, or negative" if (values <= FLOOR).any() else ""
     values = np.minimum(values, top)
     shift = np.linspace(-0.28, 0.28, len(values))
     for index in range(len(names)):
         style = look(index)
         axis.scatter(values[:, index], index + shift, s=14, linewidths=0, zorder=3, alpha=0.8, **style)
         axis.plot([np.median(values[:, index])] * 2, [index - 0.4, index + 0.4], color="black", linewidth=1.4)
-    axis.set(xscale="log", xlabel=f"excess  M(p) / M* − 1  (line: median{note})", ylim=(len(names) - 0.5, -0.5))
+    axis.set(xscale="log", xlabel=f"excess  M(p) / M* − 1  (line: median){note}", ylim=(len(names) - 0.5, -0.5))
     axis.set_yticks(range(len(names)), [short(name, 34) for name in names])
     axis.grid(True, axis="x")
     figure.suptitle(f"Distance from the best possible density, {len(values)} contexts", fontsize=10)
