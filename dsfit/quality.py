@@ -157,6 +157,9 @@ def quadrature_nodes(
     """Nodes for fits: the cells that integrate |f| to `rtol`, each with a tensor Gauss rule of `count` x `count`
     points.
 
+    `rtol` holds for `count = 10`, the rule that the cells were refined by; the default is sparser (some 1e-4 for smooth
+    integrands), because a fit evaluates every node at every step and judges its result by `excess` afterwards.
+
     Args:
         context: a single context (batch shape `()`).
         even: keep only phi >= 0, with doubled weights. Only for integrands and densities even in azimuth.
