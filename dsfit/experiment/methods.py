@@ -114,9 +114,16 @@ class Plan:
         }
 
     def least_samples(self, uniforms: str) -> int:
-        """Fewest samples with at least two for every strategy (and replicate, where uniforms are not independent)."""
-        least = 2 if self.model == "one" else math.ceil(2 / min(self.fractions))
-        return least * (16 if uniforms != "random" else 1)
+        """Fewest samples that can be asked for: every strategy gets what the estimator cannot do without.
+
+        That is two samples with the optimal heuristic and one in each of 16 replicates where uniforms are not
+        independent; otherwise a strategy with a small share may go without at small sample counts.
+        """
+        if uniforms != "random":
+            return math.ceil(16 / (1 if self.model == "one" else min(self.fractions)))
+        if self.heuristic_name == "optimal" and self.model == "multi":
+            return math.ceil(2 / min(self.fractions))
+        return 2 * len(self.strategies)
 
     def density(self, omega: Tensor, context: Context) -> Tensor:
         """Density per steradian of all samples together, `sum_s c_s p_s`."""
@@ -251,10 +258,11 @@ def check_method(raw: RawConfig, index: int, method: Any) -> None:
         except InputError as error:
             raise refuse(("heuristic",), f"{error.allowed} ({error.field})") from None
     if isinstance(method, FittedMethod):
+        from dsfit.fit.objectives import objective_named
         from dsfit.fit.solvers import solver_named
 
         try:
-            solver_named(method.solver)
+            solver_named(method.solver, objective_named(method.objective).least_squares)
         except InputError as error:
             raise refuse(("solver",), error.allowed) from None
 

@@ -166,6 +166,20 @@ def test_float32_estimates_agree_with_the_float64_reference() -> None:
     assert 0.6 < curve["estimates"][0]["rmse"] / curve["estimates"][0]["predicted_rmse"] < 1.6
 
 
+@pytest.mark.parametrize("uniforms", ["random", "sobol"])
+@pytest.mark.parametrize(("heuristic", "model"), [("balance", "multi"), ("balance", "one"), ("optimal", "multi")])
+def test_the_fewest_samples_suffice(uniforms: str, heuristic: str, model: str) -> None:
+    mix = {"kind": "heuristic_mix", "proposals": ["TT", "uniform", "TRT"], "weights": [1, 2, 7]}
+    place = setting(named({**mix, "heuristic": heuristic, "model": model}))
+    plan = plans(place)[0]
+    truth = reference(place.integrand, place.context, rtol=1e-3)
+    options = EstimateConfig(samples=[2, 512], repeats=4, rounds=1, uniforms=uniforms)
+    curve = compare._estimates(
+        plan, place.integrand, place.context, options, truth, 1.0, torch.Generator().manual_seed(0)
+    )
+    assert len(curve["estimates"]) == 2 and all(math.isfinite(p["rmse"]) for p in curve["estimates"])
+
+
 def points(*pairs: tuple[int, float]) -> list[dict[str, Any]]:
     return [{"samples": n, "rmse": e} for n, e in pairs]
 
