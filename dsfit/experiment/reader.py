@@ -27,6 +27,10 @@ class ConfigError(InputError):
     """
 
     def __init__(self, source: str, field: str, value: object, allowed: str) -> None:
+        try:
+            repr(value)
+        except (ValueError, RecursionError):  # an integer of thousands of digits, a table nested without end
+            value = "a value too long to show"
         super().__init__(field, value, allowed)
         self.source = source
         self.args = (f"{source}: {self.args[0]}",)
@@ -99,9 +103,13 @@ def read(path: str | Path, overrides: Sequence[str] = ()) -> RawConfig:
         ConfigError: a file is missing or not TOML, `extends` runs in a circle, or an override cannot be applied.
     """
     raw = RawConfig(Path(path).stem, str(path), {})
-    _read_into(raw, Path(path), [], str(path))
-    for override in overrides:
-        apply_override(raw, override)
+    try:
+        _read_into(raw, Path(path), [], str(path))
+        for override in overrides:
+            apply_override(raw, override)
+        copy.deepcopy(raw.data)
+    except RecursionError:
+        raise ConfigError(str(path), "(file)", "tables within tables without end", "a few levels of tables") from None
     return raw
 
 

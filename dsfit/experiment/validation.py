@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import types
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -131,6 +132,8 @@ def _cross_check(raw: RawConfig, config: Config) -> None:
         if slug(method.name) in seen:
             raise raw.error(("methods", index, "name"), "names that differ in their letters and digits")
         seen.add(slug(method.name))
+    if math.prod(len(x) for x in _context_lists(config)) > MAX_CELLS:
+        raise raw.error(("contexts",), f"at most {MAX_CELLS} combinations")
     lengths = {len(x) for x in _context_lists(config) if len(x) != 1}
     if config.contexts.combine == "zip" and len(lengths) > 1:
         raise raw.error(

@@ -76,6 +76,14 @@ def test_damaged_files_give_one_error_with_the_file_name(tmp_path: Path, content
         read(path)
 
 
+def test_tables_nested_without_end_and_endless_numbers(tmp_path: Path) -> None:
+    path = write(tmp_path, "a.toml", ".".join(["a"] * 3000) + " = 1\n")
+    with pytest.raises(ConfigError, match=r"a\.toml: .*a few levels of tables"):
+        read(path)
+    with pytest.raises(ConfigError, match="too long to show"):
+        raise read(write(tmp_path, "b.toml", "x = 0x" + "f" * 5000)).error(("x",), "less")
+
+
 def test_missing_file_and_folder(tmp_path: Path) -> None:
     for path in (tmp_path / "none.toml", tmp_path, tmp_path / "x\0y"):
         with pytest.raises(ConfigError, match="readable TOML file"):

@@ -73,6 +73,7 @@ def message(**data: Any) -> str:
         ({"contexts": {"theta_r_deg": [0, 91]}}, ["contexts.theta_r_deg.1: got 91", ">= -90 and <= 90"]),
         ({"contexts": {"n": []}}, ["contexts.n: got []", "at least one element"]),
         ({"contexts": {"n": [0, 1], "theta_r_deg": [0, 1, 2], "combine": "zip"}}, ["contexts.combine", "equal length"]),
+        ({"contexts": {"n": [1] * 1000, "theta_r_deg": [1] * 1000}}, ["contexts: got", "at most 100000"]),
         ({"methods": []}, ["methods: got []", "at least one [[methods]]"]),
         ({"methods": [UNIFORM, UNIFORM]}, ["methods.1.name: got 'uniform'", "differ"]),
         ({"methods": [UNIFORM, {**UNIFORM, "name": "uniform "}]}, ["methods.1.name: got 'uniform '", "differ"]),
