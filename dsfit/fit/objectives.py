@@ -144,7 +144,7 @@ def divergence_residuals(log_p: Tensor, weight: Tensor, log_best: Tensor) -> Ten
 
 
 class Excess(Objective):
-    """The excess of second moment `M(p) / M* - 1`, also the chi-square divergence of P* from p (DESIGN section 1)."""
+    """The excess of second moment `M(p) / M* - 1`, also the chi-square divergence of P* from p."""
 
     name = "excess"
 
