@@ -230,7 +230,7 @@ def _excess_one(
             gap = torch.where(target > 0, (ratio - 1) * (target - density), density)
             return torch.stack([gap + 1e-4 * target, density], dim=-1)
 
-        found = _cubature(integrand, context, columns, min(rtol, 1e-3) * 1.0, max_evaluations, False)
+        found = _cubature(integrand, context, columns, min(rtol, 1e-3), max_evaluations, False)
         return found.value[0] - 1e-4, found.error[0], largest, found.value[1], found.converged
 
 

@@ -12,7 +12,7 @@ from dsfit.bsdf.attenuation import Absorption, attenuation, lobe_energies
 from dsfit.bsdf.fiber import Fiber
 from dsfit.bsdf.glint import Glint
 from dsfit.bsdf.scattered import offset_windows, simplified_windows
-from dsfit.bsdf.snell import Caustic, Refraction, exit_trt_slope, gamma_tt, root_falling, root_rising
+from dsfit.bsdf.snell import Caustic, Rays, Refraction, rays_trt, rays_tt
 from dsfit.frame import HALF_PI, wrap
 from dsfit.special import wrapped_normal_log_prob
 
@@ -67,42 +67,23 @@ def _n_r(fiber: Fiber, bent: Refraction, phi: Tensor, absorption: Absorption) ->
 
 
 def _n_tt(fiber: Fiber, bent: Refraction, phi: Tensor, absorption: Absorption) -> Tensor:
-    """TT: one ray for |phi| >= 2 asin(kappa), none otherwise; |dphi/dh|^-1 = cos g cos g_t (kappa cos g + cos g_t)/(2
-    (1 - kappa^2)).
-    """
-    kappa = bent.kappa
-    lit = phi > 2 * torch.asin(kappa)
-    inside = torch.where(lit, phi, math.pi)
-    sin_gamma, cos_gamma = gamma_tt(kappa, inside)
-    x = kappa * sin_gamma
-    cos_t = torch.sqrt((1 - x) * (1 + x))
-    density = cos_gamma * cos_t * (kappa * cos_gamma + cos_t) / (2 * (1 - kappa) * (1 + kappa))
-    value = attenuation(1, bent, fiber.sigma_a, sin_gamma, cos_gamma, absorption) * (density / 2).unsqueeze(-1)
-    return torch.where(lit.unsqueeze(-1), value, 0.0)
+    """TT: at most one ray."""
+    return _lobe_of(1, rays_tt(bent.kappa, phi), fiber, bent, absorption)
+
+
+def _lobe_of(p: int, rays: Rays, fiber: Fiber, bent: Refraction, absorption: Absorption) -> Tensor:
+    """A(p, h) |dh/dphi| / 2 of one branch of rays, 0 where there is none."""
+    value = attenuation(p, bent, fiber.sigma_a, rays.sin_gamma, rays.cos_gamma, absorption)
+    return torch.where(rays.lit.unsqueeze(-1), value * (rays.spread / 2).unsqueeze(-1), 0.0)
 
 
 def _n_trt(fiber: Fiber, bent: Refraction, phi: Tensor, model: AzimuthalModel, absorption: Absorption) -> Tensor:
     """TRT: up to three rays; two meet at the caustic phi_c, where the raw density is infinite."""
-    kappa = bent.kappa
-    kappa, phi = torch.broadcast_tensors(kappa, phi)
+    kappa, phi = torch.broadcast_tensors(bent.kappa, phi)
     caustic = Caustic.at(kappa)
-    below = phi < caustic.phi
-    branches = [
-        (caustic.folded & below, root_rising, phi),
-        ((phi > caustic.edge) & below, root_falling, phi),
-        (-phi > caustic.edge, root_falling, -phi),
-    ]
-    total: Tensor | float = 0.0
-    for lit, root, azimuth in branches:
-        if not bool(lit.any()):
-            continue
-        gamma = root(kappa, caustic, torch.where(lit, azimuth, (caustic.phi + caustic.edge).detach() / 2))
-        slope = exit_trt_slope(kappa, gamma).abs().clamp_min(4 * torch.finfo(phi.dtype).eps ** 0.5)
-        sin_gamma, cos_gamma = torch.sin(gamma), torch.cos(gamma).clamp_min(0.0)
-        value = attenuation(2, bent, fiber.sigma_a, sin_gamma, cos_gamma, absorption)
-        total = total + torch.where(lit.unsqueeze(-1), value * (cos_gamma / slope / 2).unsqueeze(-1), 0.0)
-    if isinstance(total, float):
-        total = torch.zeros(*phi.shape, fiber.channels, dtype=phi.dtype, device=phi.device)
+    total = torch.zeros(*phi.shape, fiber.channels, dtype=phi.dtype, device=phi.device)
+    for rays in rays_trt(kappa, caustic, phi):
+        total = total + _lobe_of(2, rays, fiber, bent, absorption)
     if model == "raw":
         return total
     glint = Glint.of(fiber, bent, caustic, absorption)

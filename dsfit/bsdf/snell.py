@@ -16,12 +16,14 @@ the way.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from dsfit.frame import HALF_PI
+from dsfit.special import any_of
 
 _NEWTON_STEPS = 12
 
@@ -147,3 +149,45 @@ def _attach(kappa: Tensor, gamma: Tensor, phi: Tensor) -> Tensor:
     slope = torch.where(slope < 0, slope.clamp_max(-limit), slope.clamp_min(limit))
     step = (phi - exit_trt(kappa, gamma)) / slope
     return gamma + (step - step.detach())
+
+
+@dataclass(frozen=True)
+class Rays:
+    """The rays of one branch that leave at given azimuths: where there is one, its offset h = sin gamma, and
+    |dh/dphi|.
+    """
+
+    lit: Tensor
+    sin_gamma: Tensor
+    cos_gamma: Tensor
+    spread: Tensor
+
+
+def rays_tt(kappa: Tensor, phi: Tensor) -> Rays:
+    """TT at |phi|: one ray for |phi| > 2 asin(kappa); |dh/dphi| = cos g cos g_t (kappa cos g + cos g_t)/(2 (1 -
+    kappa^2)).
+    """
+    lit = phi > 2 * torch.asin(kappa)
+    sin_gamma, cos_gamma = gamma_tt(kappa, torch.where(lit, phi, math.pi))
+    cos_t = cos_refracted(kappa, sin_gamma)
+    spread = cos_gamma * cos_t * (kappa * cos_gamma + cos_t) / (2 * (1 - kappa) * (1 + kappa))
+    return Rays(lit, sin_gamma, cos_gamma, spread)
+
+
+def rays_trt(kappa: Tensor, caustic: Caustic, phi: Tensor) -> Iterator[Rays]:
+    """TRT at |phi|: up to three rays; two meet at the caustic, where |dh/dphi| is infinite. Unlit branches are left
+    out.
+    """
+    below = phi < caustic.phi
+    limit = 4 * torch.finfo(phi.dtype).eps ** 0.5
+    for lit, root, azimuth in (
+        (caustic.folded & below, root_rising, phi),
+        ((phi > caustic.edge) & below, root_falling, phi),
+        (-phi > caustic.edge, root_falling, -phi),
+    ):
+        if not any_of(lit):
+            continue
+        gamma = root(kappa, caustic, torch.where(lit, azimuth, (caustic.phi + caustic.edge).detach() / 2))
+        cos_gamma = torch.cos(gamma).clamp_min(0.0)
+        slope = exit_trt_slope(kappa, gamma).abs().clamp_min(limit)
+        yield Rays(lit, torch.sin(gamma), cos_gamma, cos_gamma / slope)

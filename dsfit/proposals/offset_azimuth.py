@@ -9,16 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dsfit.bsdf.snell import (
-    Caustic,
-    Refraction,
-    cos_refracted,
-    exit_trt,
-    exit_trt_slope,
-    gamma_tt,
-    root_falling,
-    root_rising,
-)
+from dsfit.bsdf.snell import Caustic, Refraction, exit_trt, rays_trt, rays_tt
 from dsfit.context import Context
 from dsfit.errors import check_choice, check_range
 from dsfit.frame import wrap
@@ -61,25 +52,13 @@ class OffsetDistribution(AzimuthalDistribution):
         return torch.cos(phi / 2).clamp_min(0.0) / 4
 
     def _tt(self, kappa: Tensor, phi: Tensor) -> Tensor:
-        lit = phi > 2 * torch.asin(kappa)
-        sin_gamma, cos_gamma = gamma_tt(kappa, torch.where(lit, phi, math.pi))
-        cos_t = cos_refracted(kappa, sin_gamma)
-        density = cos_gamma * cos_t * (kappa * cos_gamma + cos_t) / (4 * (1 - kappa) * (1 + kappa))
-        return torch.where(lit, density, 0.0)
+        rays = rays_tt(kappa, phi)
+        return torch.where(rays.lit, rays.spread / 2, 0.0)
 
     def _trt(self, kappa: Tensor, phi: Tensor) -> Tensor:
-        caustic = Caustic.at(kappa)
-        below = phi < caustic.phi
-        middle = (caustic.phi + caustic.edge).detach() / 2
         total = torch.zeros_like(phi)
-        for lit, root, azimuth in (
-            (caustic.folded & below, root_rising, phi),
-            ((phi > caustic.edge) & below, root_falling, phi),
-            (-phi > caustic.edge, root_falling, -phi),
-        ):
-            gamma = root(kappa, caustic, torch.where(lit, azimuth, middle))
-            slope = exit_trt_slope(kappa, gamma).abs().clamp_min(4 * torch.finfo(phi.dtype).eps ** 0.5)
-            total = total + torch.where(lit, torch.cos(gamma).clamp_min(0.0) / (2 * slope), 0.0)
+        for rays in rays_trt(kappa, Caustic.at(kappa), phi):
+            total = total + torch.where(rays.lit, rays.spread / 2, 0.0)
         return total
 
 
