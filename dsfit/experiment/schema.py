@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from dsfit.experiment.check_schema import CheckConfig
+from dsfit.experiment.sections import Section
 
 SCHEMA_VERSION = 1
 
@@ -16,12 +19,6 @@ Inclination = Annotated[float, Field(ge=-90, le=90)]
 Name = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[^\x00-\x1f/\\]+$")]
 Preset = Literal["nonabsorbing", "blond", "brown", "black"]
 HeuristicName = Literal["balance", "power", "maximum", "cutoff", "optimal"]
-
-
-class Section(BaseModel):
-    """A table of the config; unknown keys, wrong types, nan and inf are refused."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
 
 class FiberConfig(Section):
@@ -236,7 +233,7 @@ class Config(Section):
     """A whole experiment."""
 
     title: Annotated[str, Field(max_length=200)] = ""
-    kind: Literal["compare", "sweep", "transmittance"] = "compare"
+    kind: Literal["compare", "sweep", "transmittance", "check"] = "compare"
     fiber: FiberConfig = FiberConfig()
     bsdf: BsdfConfig = BsdfConfig()
     light: LightConfig = ConstantLight()
@@ -247,3 +244,4 @@ class Config(Section):
     output: OutputConfig = OutputConfig()
     sweep: SweepConfig = SweepConfig()
     transmittance: TransmittanceConfig = TransmittanceConfig()
+    check: CheckConfig = CheckConfig()

@@ -123,7 +123,7 @@ def _flatten(grid: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _cross_check(raw: RawConfig, config: Config) -> None:
-    if config.kind != "transmittance" and not config.methods:
+    if config.kind in ("compare", "sweep") and not config.methods:
         raise raw.error(("methods",), "at least one [[methods]] table", [])
     if config.kind == "sweep" and not config.sweep.grid:
         raise raw.error(("sweep", "grid"), "at least one dotted key with a list of values, as kind is 'sweep'", {})

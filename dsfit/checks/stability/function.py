@@ -1,0 +1,50 @@
+"""What the atlas holds: a function of the library, its 50-digit twin, and the regimes it is measured in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import Tensor
+
+Point = tuple[float, ...]
+"""One value for each argument."""
+
+
+@dataclass(frozen=True)
+class Function:
+    """A row of the atlas.
+
+    The arguments are rounded to the dtype first and handed to the twin as they are, so that an error is the code's own,
+    not that of the rounding of its input.
+
+    Attributes:
+        name: how the atlas calls it, as in `bsdf.N_TT`.
+        arguments: names of the scalar arguments.
+        compute: the library's function of tensors `[K]`, one per argument, to `[K]`.
+        exact: the twin, of mpmath numbers, one per argument, at whatever precision mpmath is set to. Shares no code
+            with `compute`.
+        regimes: name of a regime to its points.
+        gradients: arguments in which the derivative is measured too; all if left out.
+        naive: the formula as one would write it down first, shown beside the stable one; None if it is the same.
+        logarithm: the value is the log of a density, whose absolute error is the relative error of the density.
+        scale: a point's size below which an error counts as absolute (arguments, exact value -> size); 0 if left
+            out. For functions that cross zero, where no relative error can be small.
+        density: negative values are faults.
+        limits: largest relative error that the tests accept by dtype name, value and gradient.
+    """
+
+    name: str
+    arguments: tuple[str, ...]
+    compute: Callable[..., Tensor]
+    exact: Callable[..., Any]
+    regimes: Mapping[str, Sequence[Point]]
+    gradients: tuple[str, ...] | None = None
+    naive: Callable[..., Tensor] | None = None
+    logarithm: bool = False
+    scale: Callable[..., float] | None = None
+    density: bool = False
+    limits: Mapping[str, tuple[float, float]] = field(
+        default_factory=lambda: {"float64": (1e-11, 1e-8), "float32": (1e-4, 1e-3)}
+    )

@@ -1,0 +1,84 @@
+"""`[check]`: what `dsfit check` runs, and the options of each suite."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from dsfit.experiment.sections import Section
+
+SuiteName = Literal[
+    "chi_square", "independent", "furnace", "gradients", "stability", "stiff_fits", "controls", "faults"
+]
+Level = Annotated[float, Field(gt=0, lt=1)]
+Count = Annotated[int, Field(ge=1)]
+Names = Literal["all"] | Annotated[list[str], Field(min_length=1)]
+
+
+class ChiSquareOptions(Section):
+    """`[check.chi_square]`: directions drawn from each proposal, and cells in theta_i and phi."""
+
+    samples: Annotated[int, Field(ge=100, le=10**8)] = 100_000
+    cells: Annotated[list[Annotated[int, Field(ge=1, le=1000)]], Field(min_length=2, max_length=2)] = [24, 16]
+
+
+class IndependentOptions(Section):
+    """`[check.independent]`: ensembles of walkers that draw from |F| / int |F|."""
+
+
+class FurnaceOptions(Section):
+    """`[check.furnace]`."""
+
+
+class GradientsOptions(Section):
+    """`[check.gradients]`."""
+
+
+class StabilityOptions(Section):
+    """`[check.stability]`: functions by name, and decimal digits of the reference arithmetic."""
+
+    functions: Names = "all"
+    digits: Annotated[int, Field(ge=30, le=500)] = 50
+
+
+class StiffFitsOptions(Section):
+    """`[check.stiff_fits]`."""
+
+    problems: Names = "all"
+    solvers: Names = "all"
+
+
+class ControlsOptions(Section):
+    """`[check.controls]`: controls by name."""
+
+    controls: Names = "all"
+
+
+class FaultsOptions(Section):
+    """`[check.faults]`: faults by name."""
+
+    faults: Names = "all"
+
+
+class CheckConfig(Section):
+    """`[check]`: suites, the level of each suite's family of p-values, and the proposals that are checked.
+
+    `proposals` are names of the chapter's, "light", "mixture" (all of the chapter's in equal shares), "structured" (as
+    it starts) or "fitted"; "all" is all but "fitted". `saved` are files of `dsfit.save_proposal`, `user` functions
+    `module:name` that take (integrand, context) and return a proposal.
+    """
+
+    suites: Annotated[list[SuiteName], Field(min_length=1)] = ["chi_square", "independent", "furnace", "gradients"]
+    level: Level = 0.01
+    proposals: Names = "all"
+    saved: list[str] = []
+    user: list[str] = []
+    chi_square: ChiSquareOptions = ChiSquareOptions()
+    independent: IndependentOptions = IndependentOptions()
+    furnace: FurnaceOptions = FurnaceOptions()
+    gradients: GradientsOptions = GradientsOptions()
+    stability: StabilityOptions = StabilityOptions()
+    stiff_fits: StiffFitsOptions = StiffFitsOptions()
+    controls: ControlsOptions = ControlsOptions()
+    faults: FaultsOptions = FaultsOptions()
