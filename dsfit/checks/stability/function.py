@@ -53,7 +53,15 @@ class Function:
         scale: a point's size below which an error counts as absolute (arguments, exact value -> size); 0 if left
             out. For functions that cross zero, where no relative error can be small.
         density: negative values are faults.
-        limits: largest relative error that the tests accept by dtype name, value and gradient.
+        limits: largest relative error that is accepted, by dtype name: of the value, and of the gradient.
+        loose: limits of single regimes, or of classes of them, where the mathematics gives away more; say why.
+
+    How an error is measured. Value: `|got - exact| / max(|exact|, scale)`, with scale at least 1 for logarithms, so
+    that the rounding of a large logarithm is not held against the code. Derivative in x_k: relative to
+    `max(|d_k|, 1e-3 max_j |d_j| u_j / u_k)`, `u = max(|x|, 1e-3)`: one that is a thousand times smaller than another,
+    per relative change of the argument, counts as zero. Exact values outside the dtype's normal range may be rounded to
+    0 or inf. A twin returns `mpmath.nan` for points that rounding has put outside the function's domain; these are
+    left out. Not a number, an infinity or zero in place of a number, or a negative density count as an infinite error.
     """
 
     name: str
@@ -69,3 +77,21 @@ class Function:
     limits: Mapping[str, tuple[float, float]] = field(
         default_factory=lambda: {"float64": (1e-11, 1e-8), "float32": (1e-4, 1e-3)}
     )
+    loose: Mapping[str, Mapping[str, tuple[float, float]]] = field(default_factory=dict)
+
+    def limit(self, regime: str, dtype: str) -> tuple[float, float]:
+        """Limits of value and gradient in that regime."""
+        kind = class_of(regime)
+        return self.loose.get(regime, self.loose.get(kind, self.limits)).get(dtype, self.limits[dtype])
+
+
+def class_of(regime: str) -> str:
+    """The class of a regime, `CLASSES`.
+
+    Raises:
+        KeyError: none of them.
+    """
+    kind = regime.partition(":")[0]
+    if kind not in CLASSES:
+        raise KeyError(f"{regime!r} is of no class; classes are {', '.join(CLASSES)}")
+    return kind
