@@ -1,14 +1,14 @@
-"""The command line: `dsfit run CONFIG`, `dsfit show RUNDIR`, `dsfit presets`.
+"""The command line: `dsfit run CONFIG`, `dsfit check CONFIG`, `dsfit show RUNDIR`, `dsfit presets`.
 
 Exit codes: 0 done, 1 the run failed (what is done is kept), 2 the config or an argument is wrong (nothing was
-written), 130 interrupted.
+written), 3 a check was not passed, 130 interrupted.
 """
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -29,21 +29,50 @@ def _group() -> None:
     pass  # makes `run` a subcommand whatever else there is
 
 
+Config = Annotated[Path, typer.Argument(help="TOML file; configs/quickstart.toml is a good start.")]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change one key, as in --set fiber.eta=1.6; may be repeated."),
+]
+Out = Annotated[Path | None, typer.Option(help="Folder for run directories, instead of output.dir.")]
+Force = Annotated[bool, typer.Option("--force", help="Compute anew what an earlier run left.")]
+Workers = Annotated[
+    int | None, typer.Option(min=0, help="Processes; default: the number of cores. 0: none but this one.")
+]
+
+
 @app.command()
 def run(
-    config: Annotated[Path, typer.Argument(help="TOML file; configs/quickstart.toml is a good start.")],
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change one key, as in --set fiber.eta=1.6; may be repeated."),
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for run directories, instead of output.dir.")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Compute anew what an earlier run left.")] = False,
-    workers: Annotated[
-        int | None, typer.Option(min=0, help="Processes; default: the number of cores. 0: none but this one.")
-    ] = None,
+    config: Config, set_: Changes = None, out: Out = None, force: Force = False, workers: Workers = None
 ) -> None:
     """Run an experiment: compute, tabulate, plot. A finished run is shown again, an interrupted one goes on where it
     stopped."""
+    _run(config, set_ or [], out, force, workers)
+
+
+@app.command()
+def check(
+    config: Config,
+    suite: Annotated[
+        list[str] | None, typer.Option(help="Run this suite instead of those of [check]; may be repeated.")
+    ] = None,
+    set_: Changes = None,
+    out: Out = None,
+    force: Force = False,
+    workers: Workers = None,
+) -> None:
+    """Check the scene, the proposals and the library: the suites that the config's [check] names, or the usual ones.
+    Exits with 3 if a check is not passed."""
+    changes = [*(set_ or []), 'kind="check"']
+    if suite:
+        changes.append("check.suites=[" + ", ".join(f'"{name}"' for name in suite) + "]")
+    result = _run(config, changes, out, force, workers)
+    if result["report"]["verdict"] != "pass":
+        raise typer.Exit(3)
+
+
+def _run(config: Path, changes: list[str], out: Path | None, force: bool, workers: int | None) -> dict[str, Any]:
+    """Run, report, and return the result; exits with 1, 2 or 130 where that cannot be done."""
     from dsfit.errors import InputError
     from dsfit.experiment import runner
     from dsfit.experiment.progress import BarProgress
@@ -51,7 +80,7 @@ def run(
     from dsfit.experiment.validation import load
 
     try:
-        experiment = load(config, set_ or [])
+        experiment = load(config, changes)
     except InputError as error:
         _fail(f"config error\n{error}", 2)
     directory = runner.run_directory(experiment, out)
@@ -65,6 +94,7 @@ def run(
         _fail(f"interrupted; the same command goes on from here: {directory.path}", 130)
     except (RunFailure, InputError, OSError) as error:
         _fail(f"run failed: {error}\nthe same command goes on from here: {directory.path}", 1)
+    return outcome.result
 
 
 @app.command()
@@ -123,7 +153,7 @@ def _report(directory: RunDirectory, result: dict[str, Any], draw: bool) -> None
         console.print(f"figures:   {figures}", soft_wrap=True)
 
 
-def _fail(message: str, code: int) -> None:
+def _fail(message: str, code: int) -> NoReturn:
     typer.echo(f"dsfit: {message}", err=True)
     raise typer.Exit(code)
 

@@ -66,13 +66,17 @@ class Cells:
 
 @dataclass(frozen=True)
 class Cubature:
-    """Integrals `[K]` with error bounds `[K]`, the cells that gave them, and what they cost."""
+    """Integrals `[K]` with error bounds `[K]`, the cells `[M]` that gave them with each cell's part `[M, K]` of the
+    integrals and of the bounds, and what they cost.
+    """
 
     value: Tensor
     error: Tensor
     evaluations: int
     converged: bool
     cells: Cells
+    parts: Tensor
+    part_errors: Tensor
 
 
 def nodes_of(cells: Cells, edges: Callable[[Tensor], Tensor], count: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -158,7 +162,7 @@ def integrate(
             rounding = 4 * torch.finfo(total.dtype).eps * value.abs().sum(0)
             relative = (error / scale).amax(-1)
             if bool((error.sum(0) + rounding <= rtol * scale).all()):
-                return Cubature(total, error.sum(0) + rounding, evaluations, True, cells)
+                return Cubature(total, error.sum(0) + rounding, evaluations, True, cells, value, error)
             order = torch.argsort(relative, descending=True)
             left = relative.sum() - torch.cumsum(relative[order], 0)
             count = int((left > 0.1 * rtol).sum()) + 1
@@ -166,7 +170,7 @@ def integrate(
             chosen = order[:count][fine[:count]]
             out_of_budget = evaluations + 2 * per_cell * len(chosen) > max_evaluations
             if out_of_budget or len(chosen) == 0:
-                return Cubature(total, error.sum(0) + rounding, evaluations, False, cells)
+                return Cubature(total, error.sum(0) + rounding, evaluations, False, cells, value, error)
             keep = torch.ones(len(cells), dtype=torch.bool)
             keep[chosen] = False
             children = cells[chosen].split(along[chosen])

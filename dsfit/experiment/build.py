@@ -173,3 +173,7 @@ def check(raw: RawConfig, config: Config) -> None:
         raise library_error(raw, section if section in ("light", "fiber") else "bsdf", error) from None
     for index, method in enumerate(config.methods):
         check_method(raw, index, method)
+    if config.kind == "check":
+        from dsfit.experiment.checking import validate
+
+        validate(raw, config)

@@ -15,7 +15,7 @@ from dsfit.experiment.validation import Experiment
 
 @dataclass(frozen=True)
 class Job:
-    """One cell: a context of a grid point, or a whole grid point for `transmittance`.
+    """One cell: a context of a grid point, a whole grid point for `transmittance`, a suite's part for `check`.
 
     Attributes:
         index: position in the run.
@@ -33,7 +33,14 @@ class Job:
 def jobs(experiment: Experiment) -> list[Job]:
     """All cells, in a fixed order."""
     found: list[Job] = []
-    for point in experiment.points:
+    for number, point in enumerate(experiment.points):
+        if experiment.config.kind == "check":
+            from dsfit.experiment.checking import work_of
+
+            for work in work_of(point.config, first=number == 0):
+                identity = {"grid": point.values, **work}
+                found.append(Job(len(found), _label(point.config, identity), identity, point.config))
+            continue
         values = list(build.context_values(point.config.contexts))
         for context in [{}] if experiment.config.kind == "transmittance" else values:
             identity = {"grid": point.values, "context": context}
@@ -45,6 +52,8 @@ _SHOWN_ANYWAY = ("fiber.preset", "contexts.theta_r_deg", "contexts.phi_r_deg", "
 
 
 def _label(config: Config, identity: dict[str, Any]) -> str:
+    if identity.get("part"):
+        return f"{identity['suite']}: {identity['part']}"
     parts = [config.fiber.preset]
     parts += [f"{key.split('.')[-1]} {value}" for key, value in identity["grid"].items() if key not in _SHOWN_ANYWAY]
     context = identity["context"]
@@ -66,6 +75,10 @@ def run_job(directory: RunDirectory, job: Job, say: Callable[[str], None]) -> No
         from dsfit.experiment.transmittance import transmittance
 
         data, arrays = transmittance(job.config, say)
+    elif job.config.kind == "check":
+        from dsfit.experiment.checking import run_suite
+
+        data, arrays = run_suite(job.config, job.identity, job.label, say)
     else:
         from dsfit.experiment.compare import compare
 

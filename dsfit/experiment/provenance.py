@@ -16,7 +16,9 @@ from typing import Any
 
 from dsfit.experiment.schema import Config
 
-_PACKAGES = ("torch", "numpy", "scipy", "jax", "jaxlib", "optimistix", "OpenEXR", "pydantic", "matplotlib")
+_PACKAGES = (
+    "torch", "numpy", "scipy", "jax", "jaxlib", "optimistix", "OpenEXR", "pydantic", "matplotlib", "emcee", "mpmath",
+)  # fmt: skip
 
 
 def version() -> str:
@@ -43,6 +45,10 @@ def run_id(config: Config) -> str:
     data = config.model_dump(exclude={"output", "title"})
     if path := data["light"].get("path"):
         data["light"]["path"] = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    if config.kind == "check":
+        from dsfit.experiment.checking import files_of
+
+        data["files"] = [hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in files_of(config)]
     identity = json.dumps([data, code_version()], sort_keys=True)
     return hashlib.sha256(identity.encode()).hexdigest()[:12]
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from dsfit.experiment import files, provenance
+from dsfit.experiment import check_report, files, provenance
 from dsfit.experiment.cells import Job, jobs, run_job
 from dsfit.experiment.rundir import RunDirectory, RunFailure
 from dsfit.experiment.schema import SCHEMA_VERSION
@@ -143,6 +143,8 @@ def run(
             "seconds": sum(s.get("seconds", 0.0) for s in sessions),
             "cells": [directory.cell(job.index, job.identity) for job in todo],
         }
+        if experiment.config.kind == "check":
+            result["report"] = check_report.report(result["cells"], experiment.config.check.level)
         directory.write_json("result.json", result)
         return Outcome(directory, {"schema_version": SCHEMA_VERSION, **result}, skipped=False)
 

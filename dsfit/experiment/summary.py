@@ -7,8 +7,10 @@ import statistics
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from rich.console import RenderableType
 from rich.table import Table
 
+from dsfit.experiment import check_report
 from dsfit.experiment.files import number
 
 
@@ -138,8 +140,10 @@ def _time(seconds: float) -> str:
     return f"{seconds / 1e-9:.3g} ns"
 
 
-def terminal_table(result: dict[str, Any]) -> Table:
+def terminal_table(result: dict[str, Any]) -> RenderableType:
     """The summary as a rich table."""
+    if result["kind"] == "check":
+        return check_report.terminal_table(result)
     if result["kind"] == "transmittance":
         return _transmittance_table(result)
     cells = result["cells"]
@@ -180,6 +184,8 @@ def _transmittance_table(result: dict[str, Any]) -> Table:
 
 def markdown(result: dict[str, Any]) -> str:
     """The summary as a Markdown table, with the same numbers."""
+    if result["kind"] == "check":
+        return check_report.markdown(result)
     if result["kind"] == "transmittance":
         head = ["fibre", "n", *_FIT_COLUMNS]
         body = [head, ["---"] * len(head), *_transmittance_rows(result)]

@@ -66,6 +66,13 @@ def _anchor_paths(raw: RawConfig) -> None:
         source = raw.source(("light", "path"))
         folder = Path(source).parent if Path(source).is_file() else Path()
         raw.data["light"]["path"] = str((folder / path).resolve())
+    for key in ("saved", "user"):
+        paths = raw.lookup(("check", key))
+        for k, item in enumerate(paths if isinstance(paths, list) else []):
+            if isinstance(item, str) and item and "\0" not in item:
+                source = raw.source(("check", key))
+                folder = Path(source).parent if Path(source).is_file() else Path()
+                paths[k] = str((folder / item).resolve())
 
 
 def validate(raw: RawConfig) -> Config:

@@ -8,6 +8,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from dsfit.experiment.plots.checks import checks
 from dsfit.experiment.plots.convergence import convergence
 from dsfit.experiment.plots.excess import excess_bars, excess_grid
 from dsfit.experiment.plots.maps import maps
@@ -31,6 +32,9 @@ def _figures(directory: RunDirectory, result: dict[str, Any]) -> Iterator[tuple[
         from dsfit.experiment.plots.transmittance import transmittance
 
         yield from transmittance(directory, result)
+        return
+    if result["kind"] == "check":
+        yield from checks(directory, result)
         return
     yield "convergence", convergence(result)
     yield "excess", excess_bars(result)
