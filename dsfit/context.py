@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsfit.errors import check_range
+from dsfit.errors import as_real, check_broadcast, check_range, common_dtype
 from dsfit.frame import HALF_PI
 
 
@@ -27,7 +27,7 @@ class Context:
     a context of shape `[*batch]` has shape `[*samples, *batch, 2]`.
 
     Raises:
-        InputError: a field is not finite or out of range.
+        InputError: a field is not a real number, not finite or out of range, shapes do not broadcast, another dtype.
     """
 
     theta_r: Tensor
@@ -38,10 +38,9 @@ class Context:
     def __init__(
         self, theta_r: Any, phi_r: Any = 0.0, n: Any = 0.0, v: Any = None, *, dtype: torch.dtype | None = None
     ) -> None:
-        given = [x for x in (theta_r, phi_r, n, v) if isinstance(x, Tensor) and x.is_floating_point()]
-        dtype = dtype or (given[0].dtype if given else torch.float64)
-        device = given[0].device if given else None
-        fields = [torch.as_tensor(x, dtype=dtype, device=device) for x in (theta_r, phi_r, n)]
+        dtype, device = common_dtype("context.dtype", dtype, (theta_r, phi_r, n, v))
+        given = {"theta_r": theta_r, "phi_r": phi_r, "n": n}
+        fields = [as_real(f"context.{name}", value, dtype, device) for name, value in given.items()]
         limit = torch.tensor(HALF_PI, dtype=dtype).item()
         check_range("context.theta_r", fields[0], -limit, limit)
         check_range("context.phi_r", fields[1])
@@ -49,7 +48,8 @@ class Context:
         if v is None:
             share = (fields[2] == 0).to(dtype)
         else:
-            share = check_range("context.v", torch.as_tensor(v, dtype=dtype, device=device), 0.0, 1.0)
+            share = check_range("context.v", as_real("context.v", v, dtype, device), 0.0, 1.0)
+        check_broadcast(theta_r=fields[0], phi_r=fields[1], n=fields[2], v=share)
         for name, value in zip(("theta_r", "phi_r", "n", "v"), torch.broadcast_tensors(*fields, share), strict=True):
             object.__setattr__(self, name, value)
 

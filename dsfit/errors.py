@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
+
+FLOATS = (torch.float64, torch.float32)
+"""The dtypes that everything is computed in."""
 
 
 class InputError(ValueError):
@@ -17,13 +22,69 @@ class InputError(ValueError):
 
     def __init__(self, field: str, value: object, allowed: str) -> None:
         self.field, self.value, self.allowed = field, value, allowed
-        shown = repr(value)
+        try:
+            shown = repr(value)
+        except (ValueError, RecursionError):  # an integer of thousands of digits, a table nested without end
+            shown = "a value too long to show"
         shown = shown if len(shown) <= 120 else shown[:117] + "..."
         super().__init__(f"{field}: got {shown}; allowed: {allowed}")
 
 
 def _first_bad(value: Tensor, bad: Tensor) -> float:
     return value.detach()[bad].flatten()[0].item()
+
+
+def check_dtype(field: str, dtype: object) -> torch.dtype:
+    """Return `dtype` if it is float64 or float32, else raise `InputError`."""
+    if not isinstance(dtype, torch.dtype) or dtype not in FLOATS:
+        raise InputError(field, dtype, "torch.float64 or torch.float32")
+    return dtype
+
+
+def common_dtype(field: str, dtype: object, values: tuple[Any, ...]) -> tuple[torch.dtype, torch.device | None]:
+    """The dtype asked for or, left out, that of the first floating-point tensor, else float64; and that tensor's
+    device."""
+    given = [x for x in values if isinstance(x, Tensor) and x.is_floating_point()]
+    if dtype is None:
+        dtype = given[0].dtype if given else torch.float64
+    return check_dtype(field, dtype), given[0].device if given else None
+
+
+def as_real(
+    field: str, value: Any, dtype: torch.dtype | None = None, device: torch.device | str | None = None
+) -> Tensor:
+    """`value` as a tensor of `dtype`; left out, tensors keep float64 and float32 and everything else becomes float64.
+
+    Raises:
+        InputError: no numbers, complex numbers, lists of unequal lengths, numbers beyond the range of floats.
+    """
+    if dtype is None:
+        dtype = value.dtype if isinstance(value, Tensor) and value.dtype in FLOATS else torch.float64
+    kind = getattr(getattr(value, "dtype", None), "kind", "f")  # of numpy arrays
+    if (isinstance(value, Tensor) and value.is_complex()) or kind not in "biuf" or isinstance(value, str | bytes):
+        raise InputError(field, value, "real numbers, a rectangular list of real numbers, or a tensor of them")
+    try:
+        return torch.as_tensor(value, dtype=dtype, device=device)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        allowed = "real numbers, a rectangular list of real numbers, or a tensor of them"
+        raise InputError(field, value, allowed) from None
+
+
+def as_number(field: str, value: Any, low: float = -float("inf"), high: float = float("inf"), **ends: bool) -> float:
+    """A single number in a range, as a float; `ends` as for `check_range`."""
+    number = check_range(field, as_real(field, value, torch.float64), low, high, **ends)
+    if number.ndim:
+        raise InputError(field, tuple(number.shape), "a single number")
+    return float(number)
+
+
+def check_broadcast(**values: Tensor) -> torch.Size:
+    """The shape that the tensors broadcast to; `InputError` with all their shapes if they do not."""
+    try:
+        return torch.broadcast_shapes(*(value.shape for value in values.values()))
+    except RuntimeError:
+        shapes = {name: tuple(value.shape) for name, value in values.items()}
+        raise InputError(", ".join(values), shapes, "shapes that broadcast") from None
 
 
 def check_finite(field: str, value: Tensor) -> Tensor:
@@ -57,6 +118,6 @@ def check_range(
 
 def check_choice(field: str, value: object, allowed: tuple[str, ...] | list[str]) -> str:
     """Return `value` if it is one of the allowed words, else raise `InputError`."""
-    if value not in tuple(allowed):
+    if not isinstance(value, str) or value not in allowed:
         raise InputError(field, value, "one of " + ", ".join(map(repr, allowed)))
     return str(value)

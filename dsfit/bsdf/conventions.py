@@ -64,7 +64,7 @@ class Convention:
         hints = get_type_hints(type(self))
         for field in fields(self):
             allowed, value = get_args(hints[field.name]) or (True, False), getattr(self, field.name)
-            if value not in allowed:
+            if not isinstance(value, str | int) or value not in allowed:
                 raise InputError(f"convention.{field.name}", value, "one of " + ", ".join(map(repr, allowed)))
 
     @property

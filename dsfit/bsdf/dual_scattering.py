@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dsfit.arguments import all_finite, check_inside
 from dsfit.bsdf import longitudinal
 from dsfit.bsdf.averages import Averages, LobeShares, averages_from_shares
 from dsfit.bsdf.azimuthal import (
@@ -24,7 +25,7 @@ from dsfit.bsdf.conventions import Convention
 from dsfit.bsdf.fiber import Fiber
 from dsfit.bsdf.scattered import simplified_windows
 from dsfit.bsdf.tables import AzimuthTable
-from dsfit.errors import InputError, check_choice, check_range
+from dsfit.errors import InputError, as_real, check_broadcast, check_choice, check_finite, check_range, common_dtype
 from dsfit.frame import HALF_PI, cos_inclination, theta_diff, theta_half, wrap
 from dsfit.special import log_gauss
 
@@ -62,9 +63,13 @@ class DualScattering:
         convention: str | Convention = "consistent",
         precision: str = "exact",
     ) -> None:
+        if not isinstance(fiber, Fiber):
+            raise InputError("fiber", type(fiber).__name__, "a dsfit Fiber")
         self.fiber = fiber
-        self.d_f = check_range("d_f", torch.as_tensor(d_f, dtype=fiber.dtype), 0.0, 1.0)
-        self.d_b = check_range("d_b", torch.as_tensor(d_b, dtype=fiber.dtype), 0.0, 1.0)
+        self.d_f = check_range("d_f", as_real("d_f", d_f, fiber.dtype), 0.0, 1.0)
+        self.d_b = check_range("d_b", as_real("d_b", d_b, fiber.dtype), 0.0, 1.0)
+        if self.d_f.ndim or self.d_b.ndim:
+            raise InputError("d_f, d_b", (tuple(self.d_f.shape), tuple(self.d_b.shape)), "single numbers")
         self.model = check_choice("azimuthal", azimuthal, AZIMUTHAL_MODELS)
         self.convention = Convention.named(convention)
         self.precision = check_choice("precision", precision, ("exact", "table"))
@@ -267,11 +272,18 @@ class DualScattering:
         return self.model == "simplified" and self.convention.simplified_energy == "printed"
 
     def _inputs(self, theta_i: Any, theta_r: Any, phi: Any, n: Any, v: Any) -> tuple[Tensor, ...]:
-        given = [x for x in (theta_i, theta_r, phi, n, v) if isinstance(x, Tensor) and x.is_floating_point()]
-        dtype, device = (given[0].dtype, given[0].device) if given else (self.fiber.dtype, self.fiber.device)
-        values = [torch.as_tensor(x, dtype=dtype, device=device) for x in (theta_i, theta_r, phi, n)]
-        share = (values[3] == 0).to(dtype) if v is None else torch.as_tensor(v, dtype=dtype, device=device)
-        return torch.broadcast_tensors(*values, share)
+        dtype, device = common_dtype("dtype", None, (theta_i, theta_r, phi, n, v, self.fiber.eta))
+        names = {"theta_i": theta_i, "theta_r": theta_r, "phi": phi, "n": n, "v": v}
+        values = {k: as_real(k, x, dtype, device) for k, x in names.items() if x is not None}
+        if v is None:
+            values["v"] = (values["n"] == 0).to(dtype)
+        check_broadcast(**values)
+        for name in ("theta_i", "theta_r", "phi"):
+            if not all_finite(values[name]):
+                check_finite(name, values[name])
+        check_inside("n", values["n"], 0.0, math.inf)
+        check_inside("v", values["v"], 0.0, 1.0)
+        return torch.broadcast_tensors(*values.values())
 
     def _fiber(self, dtype: torch.dtype) -> Fiber:
         if dtype not in self._fibers:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsfit.errors import InputError, check_choice, check_range
+from dsfit.errors import InputError, as_real, check_broadcast, check_choice, check_range, common_dtype
 
 _DEG = math.pi / 180
 
@@ -87,11 +87,9 @@ class Fiber:
     def __init__(self, *, dtype: torch.dtype | None = None, **parameters: Any) -> None:
         for name in parameters:
             check_choice("fiber field", name, tuple(_DEFAULTS))
-        given = [x for x in parameters.values() if isinstance(x, Tensor) and x.is_floating_point()]
-        dtype = dtype or (given[0].dtype if given else torch.float64)
-        device = given[0].device if given else None
+        dtype, device = common_dtype("fiber.dtype", dtype, tuple(parameters.values()))
         for name, default in _DEFAULTS.items():
-            value = torch.as_tensor(parameters.get(name, default), dtype=dtype, device=device)
+            value = as_real(f"fiber.{name}", parameters.get(name, default), dtype, device)
             if name in ("alpha", "beta") and (value.ndim == 0 or value.shape[-1] != 3):
                 raise InputError(f"fiber.{name}", tuple(value.shape), "a last dimension of 3: R, TT, TRT")
             if name == "sigma_a" and (value.ndim == 0 or value.shape[-1] == 0):
@@ -99,6 +97,8 @@ class Fiber:
             low, high, open_low = _RANGES[name]
             check_range(f"fiber.{name}", value, low, high, open_low=open_low, open_high=name == "eccentricity")
             object.__setattr__(self, name, value)
+        batches = {k: x[..., 0] if k in ("sigma_a", "alpha", "beta") else x for k, x in self.parameters().items()}
+        check_broadcast(**batches)
 
     @classmethod
     def preset(cls, name: str, **overrides: Any) -> Fiber:

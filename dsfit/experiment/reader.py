@@ -27,10 +27,6 @@ class ConfigError(InputError):
     """
 
     def __init__(self, source: str, field: str, value: object, allowed: str) -> None:
-        try:
-            repr(value)
-        except (ValueError, RecursionError):  # an integer of thousands of digits, a table nested without end
-            value = "a value too long to show"
         super().__init__(field, value, allowed)
         self.source = source
         self.args = (f"{source}: {self.args[0]}",)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
+from dsfit.arguments import check_directions, check_uniforms
 from dsfit.context import Context
 from dsfit.errors import InputError, check_choice
 from dsfit.frame import HALF_PI, cos_inclination, to_angles, to_vector, wrap
@@ -74,9 +75,11 @@ class DensityDistribution(Distribution):
         return omega, self.log_prob(omega)
 
     def sample(self, u: Tensor) -> Tensor:
+        u = check_uniforms(u, self.dimension, self.batch_shape)
         return to_omega(self.space, self._sample(u).to(self.context.dtype), self.context.phi_r)
 
     def log_prob(self, omega: Tensor) -> Tensor:
+        check_directions(omega, self.batch_shape)
         point, log_scale = from_omega(self.space, omega, self.context.phi_r)
         inside = omega[..., 0].abs() <= HALF_PI * (1 + 4 * torch.finfo(omega.dtype).eps)
         return torch.where(inside, self._log_prob(point).to(self.context.dtype) + log_scale, -math.inf)

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, grad, jacfwd, vmap
 
+from dsfit.arguments import check_directions, check_uniforms
 from dsfit.context import Context
 from dsfit.frame import cos_inclination, wrap
 from dsfit.proposals.parameters import Constrained, constrained_values
@@ -181,17 +182,20 @@ class ProductDistribution(Distribution):
         return log_theta + log_phi - torch.log(cos_inclination(theta_i))
 
     def sample_with_log_prob(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        u = check_uniforms(u, self.dimension, self.batch_shape)
         theta_i = self.longitudinal.sample(u[..., 0])
         phi = self.azimuthal.sample(u[..., 1 : self.dimension], theta_i)
         phi_i = wrap(self.context.phi_r - phi)
         return torch.stack(torch.broadcast_tensors(theta_i, phi_i), dim=-1), self._log_prob(theta_i, phi)
 
     def sample(self, u: Tensor) -> Tensor:
+        u = check_uniforms(u, self.dimension, self.batch_shape)
         theta_i = self.longitudinal.sample(u[..., 0])
         phi_i = wrap(self.context.phi_r - self.azimuthal.sample(u[..., 1 : self.dimension], theta_i))
         return torch.stack(torch.broadcast_tensors(theta_i, phi_i), dim=-1)
 
     def log_prob(self, omega: Tensor) -> Tensor:
+        check_directions(omega, self.batch_shape)
         return self._log_prob(omega[..., 0], wrap(self.context.phi_r - omega[..., 1]))
 
 

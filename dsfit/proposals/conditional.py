@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from dsfit.context import Context
+from dsfit.errors import InputError, as_real, check_range
 from dsfit.frame import HALF_PI
 from dsfit.proposals.base import Azimuthal, AzimuthalDistribution
 from dsfit.quadrature import gauss_legendre
@@ -89,6 +90,9 @@ class FiberAzimuth(Azimuthal):
         density: nodal densities `[rows, columns + 1]` over |theta_diff| in [0, pi/2] and |phi| in [0, pi]; any positive
         scale per row. A
             row that is zero throughout becomes uniform.
+
+    Raises:
+        InputError: fewer than two rows or columns, a density that is negative or not finite.
     """
 
     density: Tensor
@@ -96,6 +100,9 @@ class FiberAzimuth(Azimuthal):
 
     def __init__(self, density: Tensor) -> None:
         super().__init__()
+        density = check_range("density", as_real("density", density), 0.0)
+        if density.ndim != 2 or min(density.shape) < 2:
+            raise InputError("density", tuple(density.shape), "shape [rows, columns + 1], at least [2, 2]")
         step = math.pi / (density.shape[1] - 1)
         mass = (density[:, 1:] + density[:, :-1]).sum(1, keepdim=True) * (step / 2)
         empty = mass <= torch.finfo(density.dtype).tiny

@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+from dsfit.arguments import check_uniforms
 from dsfit.context import Context
-from dsfit.errors import InputError, check_range
+from dsfit.errors import InputError, as_number, as_real, check_range
 from dsfit.proposals.base import Distribution, Proposal
 from dsfit.proposals.parameters import Constrained
 from dsfit.proposals.uniform import UniformSphere
@@ -54,6 +55,7 @@ class MixtureDistribution(Distribution):
         return (u[..., None] >= edges).sum(dim=-1)
 
     def sample(self, u: Tensor) -> Tensor:
+        u = check_uniforms(u, self.dimension, self.batch_shape)
         choice = self.selected(u[..., 0])
         try:
             # Under vmap sizes cannot depend on data.
@@ -133,14 +135,13 @@ class Mixture(Proposal):
         super().__init__()
         if not components:
             raise InputError("components", components, "at least one proposal")
-        if not 0 <= defensive < 1:
-            raise InputError("defensive", defensive, "numbers in [0, 1)")
-        given = torch.ones(len(components)) if weights is None else torch.as_tensor(weights, dtype=torch.float64)
+        defensive = as_number("defensive", defensive, 0.0, 1.0, open_high=True)
+        given = torch.ones(len(components)) if weights is None else as_real("weights", weights)
         given = check_range("weights", given.detach().to(torch.float64), 0.0, open_low=True)
         if given.dim() == 0 or given.shape[-1] != len(components):
             raise InputError("weights", tuple(given.shape), f"one weight for each of {len(components)} components")
         self.components = nn.ModuleList(components)
-        self.defensive = float(defensive)
+        self.defensive = defensive
         self.sphere = UniformSphere()
         logits = torch.log(given / given.sum(dim=-1, keepdim=True))
         if learnable:

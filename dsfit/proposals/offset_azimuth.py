@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dsfit.bsdf.snell import Caustic, Refraction, exit_trt, rays_trt, rays_tt
 from dsfit.context import Context
-from dsfit.errors import check_choice, check_range
+from dsfit.errors import as_real, check_choice, check_range
 from dsfit.frame import wrap
 from dsfit.proposals.base import Azimuthal, AzimuthalDistribution
 
@@ -82,7 +82,7 @@ class OffsetAzimuth(Azimuthal):
     def __init__(self, lobe: str, eta: float | Tensor) -> None:
         super().__init__()
         self.lobe = check_choice("lobe", lobe, _LOBES)
-        value = torch.as_tensor(eta, dtype=torch.float64).detach().clone()
+        value = as_real("eta", eta, torch.float64).detach().clone()
         self.register_buffer("eta", check_range("eta", value, 1.0, open_low=True))
 
     def forward(self, context: Context) -> OffsetDistribution:

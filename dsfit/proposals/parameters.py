@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from dsfit.context import Context
-from dsfit.errors import check_finite, check_range
+from dsfit.errors import as_real, check_finite, check_range
 from dsfit.frame import HALF_PI
 
 STD_BOUNDS = (1e-5, 1e2)
@@ -65,10 +65,7 @@ class Bounded(nn.Module):
         self, field: str, value: Any, low: float, high: float, *, log: bool = False, learnable: bool = True
     ) -> None:
         super().__init__()
-        if isinstance(value, Tensor) and value.is_floating_point():
-            tensor = value.detach().clone()
-        else:
-            tensor = torch.as_tensor(value, dtype=torch.float64)
+        tensor = as_real(field, value).detach().clone()
         self.low, self.high, self.log, self.learnable = low, high, log, learnable
         raw = to_raw(field, tensor, low, high, log)
         if learnable:
@@ -110,7 +107,7 @@ class Given(nn.Module):
         super().__init__()
         self.function: Callable[[Context], Tensor] | None = None
         if isinstance(value, Tensor) or not callable(value):
-            tensor = torch.as_tensor(value, dtype=torch.float64).detach().clone()
+            tensor = as_real(field, value, torch.float64).detach().clone()
             self.register_buffer("value", check_finite(field, tensor))
         else:
             self.function = value

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dsfit.arguments import check_directions, check_uniforms
 from dsfit.context import Context
 from dsfit.errors import check_choice
 from dsfit.frame import HALF_PI, cos_inclination, wrap
@@ -113,9 +114,12 @@ class UniformSphereDistribution(Distribution):
         return UniformSphereDistribution(self.context._map(take))
 
     def log_prob(self, omega: Tensor) -> Tensor:
-        return torch.full_like(omega[..., 0], -math.log(4 * math.pi))
+        check_directions(omega, self.batch_shape)
+        shape = torch.broadcast_shapes(omega.shape[:-1], self.batch_shape)
+        return torch.full_like(omega[..., 0], -math.log(4 * math.pi)).expand(shape)
 
     def sample_with_log_prob(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        u = check_uniforms(u, self.dimension, self.batch_shape)
         omega = torch.stack([inclination_of(u[..., 0]), 2 * math.pi * (u[..., 1] - 0.5)], dim=-1)
         return omega, self.log_prob(omega)
 

@@ -14,11 +14,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from dsfit.arguments import check_directions
 from dsfit.context import Context
-from dsfit.errors import InputError, check_choice, check_finite, check_range
+from dsfit.errors import InputError, as_number, as_real, check_broadcast, check_choice, check_finite, check_range
 from dsfit.frame import TWO_PI, cos_inclination, to_angles, to_vector, wrap
 from dsfit.quadrature import gauss_legendre
-from dsfit.scene.lights.base import as_tensor, tidy
+from dsfit.scene.lights.base import tidy
 
 THRESHOLD = 0.5
 """Of the thesis's rule: fewer expected crossings than this count as none."""
@@ -39,7 +40,7 @@ class Scattering(nn.Module, ABC):
     def __init__(self, v: Any = "poisson") -> None:
         super().__init__()
         self.rule = check_choice("v", v, ("poisson", "threshold")) if isinstance(v, str) else "constant"
-        self.register_buffer("share", None if isinstance(v, str) else check_range("v", as_tensor("v", v), 0.0, 1.0))
+        self.register_buffer("share", None if isinstance(v, str) else check_range("v", as_real("v", v), 0.0, 1.0))
 
     @abstractmethod
     def crossings(self, omega_i: Tensor, context: Context) -> Tensor:
@@ -54,9 +55,20 @@ class Scattering(nn.Module, ABC):
         return torch.where(n == 0, 1.0, self.share.to(n))  # type: ignore[union-attr]
 
     def forward(self, omega_i: Tensor, context: Context) -> tuple[Tensor, Tensor]:
+        check_directions(omega_i, context.batch_shape, "omega_i")
         shape = torch.broadcast_shapes(omega_i.shape[:-1], context.batch_shape)
+        self._check_batch(shape)
         n = self.crossings(omega_i, context).expand(shape)
         return n, self.lit_share(n, context).expand(shape)
+
+    def _check_batch(self, shape: torch.Size | None = None) -> None:
+        """Raise `InputError` unless the parameters broadcast with one another, or to directions of this shape."""
+        given = {key: x[..., 0] if key in ("normal", "offset") else x for key, x in self.named_buffers()}
+        if shape is None:
+            check_broadcast(**given)
+        elif check_broadcast(**given, omega_i=torch.empty(shape, device="meta")) != shape:
+            shapes = {key: tuple(x.shape) for key, x in given.items()}
+            raise InputError(", ".join(shapes), shapes, f"shapes that broadcast to the directions' {tuple(shape)}")
 
     def breakpoints(self) -> tuple[list[float], list[float]]:
         """Inclinations theta_i and absolute azimuths phi_i where n has a kink or bends sharply."""
@@ -107,8 +119,9 @@ class ConstantScattering(Scattering):
 
     def __init__(self, n: Any = None, v: Any = None) -> None:
         super().__init__(0.0 if v is None else v)
-        self.register_buffer("n", None if n is None else check_range("n", as_tensor("n", n), 0.0))
+        self.register_buffer("n", None if n is None else check_range("n", as_real("n", n), 0.0))
         self.from_context = n is None and v is None
+        self._check_batch()
         if self.n is not None and v is not None and self.share is not None and ((self.n == 0) & (self.share < 1)).any():
             raise InputError("v", v, "1 where n = 0")
 
@@ -178,21 +191,23 @@ class SlabScattering(Scattering):
         max_n: float = 100.0,
     ) -> None:
         super().__init__(v)
-        thickness = as_tensor("thickness", thickness)
+        thickness = as_real("thickness", thickness)
         if thickness.isnan().any() or (thickness <= 0).any():
             raise InputError("thickness", thickness.tolist(), "numbers > 0, or inf")
-        depth = check_range("depth", as_tensor("depth", depth), 0.0)
+        depth = check_range("depth", as_real("depth", depth), 0.0)
+        check_broadcast(thickness=thickness, depth=depth)
         if (depth > thickness).any():
             raise InputError("depth", depth.tolist(), "numbers in [0, thickness]")
-        normal = check_finite("normal", as_tensor("normal", normal))
+        normal = check_finite("normal", as_real("normal", normal))
         if normal.shape[-1:] != (3,) or (normal.norm(dim=-1) == 0).any():
             raise InputError("normal", normal.tolist(), "vectors [..., 3] of length > 0")
         self.aligned = aligned
-        self.max_n = float(check_range("max_n", as_tensor("max_n", max_n), 0.0, open_low=True))
+        self.max_n = as_number("max_n", max_n, 0.0, open_low=True)
         self.register_buffer("thickness", thickness)
         self.register_buffer("depth", depth)
-        self.register_buffer("density", check_range("density", as_tensor("density", density), 0.0))
+        self.register_buffer("density", check_range("density", as_real("density", density), 0.0))
         self.register_buffer("normal", normal / normal.norm(dim=-1, keepdim=True))
+        self._check_batch()
 
     def crossings(self, omega_i: Tensor, context: Context) -> Tensor:
         cosine = (to_vector(omega_i) * self.normal.to(omega_i)).sum(-1)
@@ -241,16 +256,18 @@ class SphereScattering(Scattering):
         self, radius: Any, density: Any, offset: Any = (0.0, 0.0, 0.0), v: Any = "poisson", *, aligned: bool = False
     ) -> None:
         super().__init__(v)
-        radius = check_range("radius", as_tensor("radius", radius), 0.0, open_low=True)
-        offset = check_finite("offset", as_tensor("offset", offset))
+        radius = check_range("radius", as_real("radius", radius), 0.0, open_low=True)
+        offset = check_finite("offset", as_real("offset", offset))
         if offset.shape[-1:] != (3,):
             raise InputError("offset", tuple(offset.shape), "shape [..., 3]")
+        check_broadcast(radius=radius, offset=offset[..., 0])
         if (offset.norm(dim=-1) > radius * (1 + 4 * torch.finfo(radius.dtype).eps)).any():
             raise InputError("offset", offset.tolist(), "points inside the sphere, |offset| <= radius")
         self.aligned = aligned
         self.register_buffer("radius", radius)
         self.register_buffer("offset", offset)
-        self.register_buffer("density", check_range("density", as_tensor("density", density), 0.0))
+        self.register_buffer("density", check_range("density", as_real("density", density), 0.0))
+        self._check_batch()
 
     def crossings(self, omega_i: Tensor, context: Context) -> Tensor:
         offset, radius = self.offset.to(omega_i), self.radius.to(omega_i)

@@ -11,19 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from dsfit.context import Context
-from dsfit.errors import InputError, check_finite
+from dsfit.errors import InputError, as_real, check_finite
 from dsfit.frame import HALF_PI, to_angles, to_vector, wrap
 from dsfit.proposals.base import Distribution, Proposal
-
-
-def as_tensor(field: str, value: Any) -> Tensor:
-    """A floating-point tensor: tensors keep their dtype, everything else becomes float64; `InputError` if it cannot."""
-    if isinstance(value, Tensor) and value.is_floating_point():
-        return value
-    try:
-        return torch.as_tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise InputError(field, value, "numbers, a rectangular list of numbers, or a tensor") from error
 
 
 def check_rotation(rotation: Any) -> Tensor | None:
@@ -33,7 +23,7 @@ def check_rotation(rotation: Any) -> Tensor | None:
     """
     if rotation is None:
         return None
-    matrix = check_finite("rotation", as_tensor("rotation", rotation))
+    matrix = check_finite("rotation", as_real("rotation", rotation))
     if matrix.shape[-2:] != (3, 3):
         raise InputError("rotation", tuple(matrix.shape), "shape [..., 3, 3]")
     data = matrix.detach().to(torch.float64)

@@ -8,10 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dsfit.arguments import check_directions, check_uniforms
 from dsfit.context import Context
-from dsfit.errors import InputError, check_range
+from dsfit.errors import InputError, as_real, check_range
 from dsfit.proposals.base import Proposal
-from dsfit.scene.lights.base import Light, LightDistribution, as_tensor
+from dsfit.scene.lights.base import Light, LightDistribution
 
 
 class ConstantLight(Light):
@@ -28,7 +29,7 @@ class ConstantLight(Light):
 
     def __init__(self, radiance: Any = 1.0) -> None:
         super().__init__()
-        value = check_range("radiance", torch.atleast_1d(as_tensor("radiance", radiance)), 0.0)
+        value = check_range("radiance", torch.atleast_1d(as_real("radiance", radiance)), 0.0)
         if value.dim() != 1 or value.numel() == 0:
             raise InputError("radiance", tuple(value.shape), "a number or a vector [C]")
         self.register_buffer("radiance", value)
@@ -42,6 +43,7 @@ class ConstantLight(Light):
         return "constant"
 
     def forward(self, omega_i: Tensor) -> Tensor:
+        check_directions(omega_i, field="omega_i")
         return self.radiance.to(omega_i).expand(*omega_i.shape[:-1], self.channels)
 
     def proposal(self) -> Proposal:
@@ -66,10 +68,13 @@ class ConstantLightDistribution(LightDistribution):
     dimension = 2
 
     def sample(self, u: Tensor) -> Tensor:
+        u = check_uniforms(u, self.dimension, self.batch_shape)
         u0, u1 = u[..., 0], u[..., 1]
         # asin(2u - 1) as an arc tangent of square roots, which neither rounds past pi/2 nor loses the poles.
         theta = 2 * torch.atan2(torch.sqrt(u0), torch.sqrt(1 - u0)) - math.pi / 2
         return torch.stack([theta, (2 * u1 - 1) * math.pi], dim=-1)
 
     def log_prob(self, omega: Tensor) -> Tensor:
-        return torch.full_like(omega[..., 0], -math.log(4 * math.pi))
+        check_directions(omega, self.batch_shape)
+        shape = torch.broadcast_shapes(omega.shape[:-1], self.batch_shape)
+        return torch.full_like(omega[..., 0], -math.log(4 * math.pi)).expand(shape)

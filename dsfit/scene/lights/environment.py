@@ -23,12 +23,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dsfit.arguments import check_directions, check_uniforms
 from dsfit.context import Context
-from dsfit.errors import InputError, check_range
+from dsfit.errors import InputError, as_number, as_real
 from dsfit.frame import to_angles
 from dsfit.proposals.base import Proposal
 from dsfit.scene.exr import read_exr
-from dsfit.scene.lights.base import Light, LightDistribution, around, as_tensor, tidy
+from dsfit.scene.lights.base import Light, LightDistribution, around, tidy
 
 _PI = math.pi
 MAX_LISTED = 64
@@ -83,8 +84,8 @@ class EnvironmentLight(Light):
     def __init__(self, image: Any, scale: float = 1.0, rotation: Any = None, *, name: str = "image") -> None:
         super().__init__(rotation)
         self.name = name
-        image = check_image(name, as_tensor(name, image))
-        self.scale = float(check_range("scale", as_tensor("scale", scale), 0.0, open_low=True))
+        image = check_image(name, as_real(name, image))
+        self.scale = as_number("scale", scale, 0.0, open_low=True)
         self.register_buffer("image", image)
         height = image.shape[0]
         # Node values of the density by row; the poles repeat the outermost rows. Tables stay float64: they are sums of
@@ -153,6 +154,7 @@ class EnvironmentLight(Light):
         return table[above, j], table[above, right], table[below, j], table[below, right]
 
     def forward(self, omega_i: Tensor) -> Tensor:
+        check_directions(omega_i, field="omega_i")
         k, t, j, s = self._coordinates(omega_i)
         a, b, c, d = (x.to(omega_i) for x in self._corners(self.image, k, j))
         t, s = t.unsqueeze(-1), s.unsqueeze(-1)
@@ -218,9 +220,10 @@ class EnvironmentDistribution(LightDistribution):
     light: EnvironmentLight
 
     def sample(self, u: Tensor) -> Tensor:
+        u = check_uniforms(u, self.dimension, self.batch_shape)
         light = self.light
         height, width = light.luminance.shape
-        u0, u1 = u.to(torch.float64).unbind(-1)
+        u0, u1 = u.to(torch.float64)[..., :2].unbind(-1)
         total = light.row_mass[-1]
         # Strictly below the total, so that the search never ends in a trailing row (or column) without mass.
         target = torch.minimum(u0 * total, torch.nextafter(total, torch.zeros_like(total)))
@@ -257,6 +260,7 @@ class EnvironmentDistribution(LightDistribution):
         return to_angles(light.to_fibre(vector)).to(u.dtype)
 
     def log_prob(self, omega: Tensor) -> Tensor:
+        check_directions(omega, self.batch_shape)
         light = self.light
         k, t, j, s = light._coordinates(omega)
         t, s = t.to(torch.float64), s.to(torch.float64)

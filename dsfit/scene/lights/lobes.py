@@ -12,11 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dsfit.arguments import check_directions, check_uniforms
 from dsfit.context import Context
-from dsfit.errors import InputError, check_choice, check_range
+from dsfit.errors import InputError, as_real, check_choice, check_range
 from dsfit.frame import to_angles, to_vector
 from dsfit.proposals.base import Proposal
-from dsfit.scene.lights.base import Light, LightDistribution, around, as_tensor, tidy
+from dsfit.scene.lights.base import Light, LightDistribution, around, tidy
 
 MAX_KAPPA = 1e6
 LOG_TWO_PI = math.log(2 * math.pi)
@@ -35,7 +36,7 @@ def log_normaliser(kappa: Tensor) -> Tensor:
 
 def unit_vectors(field: str, directions: Any) -> Tensor:
     """Directions `[K, 2]` (theta, phi) or `[K, 3]` vectors of any length > 0, to unit vectors `[K, 3]`."""
-    value = torch.atleast_2d(as_tensor(field, directions))
+    value = torch.atleast_2d(as_real(field, directions))
     if value.dim() != 2 or value.shape[-1] not in (2, 3) or value.shape[0] == 0:
         raise InputError(field, tuple(value.shape), "shape [K, 2] (theta, phi) or [K, 3] (vectors)")
     check_range(field, value)
@@ -85,16 +86,16 @@ class VonMisesFisherLights(Light):
         super().__init__(rotation)
         mu = unit_vectors("directions", directions)
         count = mu.shape[0]
-        kappa = check_range("kappa", as_tensor("kappa", kappa), 0.0, MAX_KAPPA)
+        kappa = check_range("kappa", as_real("kappa", kappa), 0.0, MAX_KAPPA)
         if kappa.dim() > 1 or kappa.numel() not in (1, count):
             raise InputError("kappa", tuple(kappa.shape), f"a number or shape [{count}]")
-        total = check_range("intensity", as_tensor("intensity", intensity), 0.0)
+        total = check_range("intensity", as_real("intensity", intensity), 0.0)
         if total.dim() == 1:
             total = total.reshape(1, -1) if count == 1 else total.reshape(-1, 1)
         if total.dim() > 2 or (total.dim() == 2 and (total.shape[0] != count or total.shape[1] == 0)):
             raise InputError("intensity", tuple(total.shape), f"a number or shape [{count}, C]")
         total = total.expand(count, 1) if total.dim() == 0 else total
-        ambient = check_range("ambient", torch.atleast_1d(as_tensor("ambient", ambient)), 0.0)
+        ambient = check_range("ambient", torch.atleast_1d(as_real("ambient", ambient)), 0.0)
         sizes = {total.shape[1], ambient.numel()} - {1}
         if ambient.dim() != 1 or len(sizes) > 1:
             raise InputError("ambient", tuple(ambient.shape), f"a number or shape [{total.shape[1]}]")
@@ -112,7 +113,7 @@ class VonMisesFisherLights(Light):
     @staticmethod
     def kappa_of_width(width: Any) -> Tensor:
         """Concentration of a narrow lobe whose standard deviation on each axis is `width` radians: 1 / width^2."""
-        return check_range("width", as_tensor("width", width), MAX_KAPPA**-0.5).pow(-2).clamp_max(MAX_KAPPA)
+        return check_range("width", as_real("width", width), MAX_KAPPA**-0.5).pow(-2).clamp_max(MAX_KAPPA)
 
     @property
     def channels(self) -> int:  # type: ignore[override]
@@ -137,6 +138,7 @@ class VonMisesFisherLights(Light):
         return self.directions @ self.rotation.to(self.directions).mT
 
     def forward(self, omega_i: Tensor) -> Tensor:
+        check_directions(omega_i, field="omega_i")
         return torch.exp(self.log_shapes(omega_i)) @ self.intensity.to(omega_i) + self.ambient.to(omega_i)
 
     def total(self) -> Tensor:
@@ -185,6 +187,7 @@ class LobesDistribution(LightDistribution):
         self.share = power / power.sum()
 
     def sample(self, u: Tensor) -> Tensor:
+        u = check_uniforms(u, self.dimension, self.batch_shape)
         light, dtype = self.light, u.dtype
         edges = torch.cumsum(self.share.detach().to(torch.float64), 0)
         last = int(self.share.detach().nonzero().max())
@@ -210,6 +213,7 @@ class LobesDistribution(LightDistribution):
         return to_angles((1 - w).unsqueeze(-1) * axis + sine.unsqueeze(-1) * offset)
 
     def log_prob(self, omega: Tensor) -> Tensor:
+        check_directions(omega, self.batch_shape)
         shapes = self.light.log_shapes(omega)
         logs = torch.cat([shapes, torch.full_like(shapes[..., :1], -math.log(4 * math.pi))], dim=-1)
         kept = self.share > 0
