@@ -49,7 +49,7 @@ def azimuthal(
 
 def simplified_shapes(fiber: Fiber, phi: Tensor) -> Tensor:
     """Unit-integral azimuths cos(phi/2)/4, wrapped g(phi - pi; gamma_TT), cos(phi/2)/4, `[..., 3]`."""
-    cosine = torch.cos(phi / 2) / 4
+    cosine = torch.cos(phi / 2).abs() / 4  # pi of float32 lies beyond pi
     transmitted = torch.exp(wrapped_normal_log_prob(wrap(phi - math.pi), fiber.gamma_tt))
     return torch.stack(torch.broadcast_tensors(cosine, transmitted, cosine), dim=-1)
 
@@ -62,7 +62,7 @@ def printed_shapes(fiber: Fiber, phi: Tensor) -> Tensor:
 
 def _n_r(fiber: Fiber, bent: Refraction, phi: Tensor, absorption: Absorption) -> Tensor:
     """R: gamma = -phi/2, |dphi/dh| = 2/cos(gamma)."""
-    sin_gamma, cos_gamma = torch.sin(phi / 2), torch.cos(phi / 2).clamp_min(0.0)
+    sin_gamma, cos_gamma = torch.sin(phi / 2), torch.cos(phi / 2).abs()  # pi of float32 lies beyond pi
     return attenuation(0, bent, fiber.sigma_a, sin_gamma, cos_gamma, absorption) * (cos_gamma / 4).unsqueeze(-1)
 
 

@@ -42,7 +42,7 @@ class Refraction:
     def at(eta: Tensor, theta_diff: Tensor) -> Refraction:
         """Bravais refraction for light of difference angle theta_diff in a fibre of index eta."""
         cos_diff = torch.cos(theta_diff).clamp_min(torch.finfo(theta_diff.dtype).eps ** 2)
-        s = torch.sqrt(eta * eta - 1 + cos_diff * cos_diff)
+        s = torch.sqrt((eta - 1) * (eta + 1) + cos_diff * cos_diff)
         return Refraction(eta, cos_diff, cos_diff / s, s / eta)
 
     def map(self, function) -> Refraction:  # noqa: ANN001
@@ -62,8 +62,13 @@ def exit_trt(kappa: Tensor, gamma: Tensor) -> Tensor:
 
 
 def exit_trt_slope(kappa: Tensor, gamma: Tensor) -> Tensor:
-    """f'(gamma) = 4 kappa cos(gamma) / cos(gamma_t) - 2."""
-    return 4 * kappa * torch.cos(gamma) / cos_refracted(kappa, torch.sin(gamma)) - 2
+    """f'(gamma) = 4 kappa cos(gamma) / cos(gamma_t) - 2 = 2 ((4 kappa^2 - 1) - 3 kappa^2 sin^2 gamma) / (cos gamma_t (2
+    kappa cos gamma + cos gamma_t)), the second form being exact where kappa is near 1/2 and gamma near 0.
+    """
+    sin_gamma = torch.sin(gamma)
+    cos_t = cos_refracted(kappa, sin_gamma)
+    top = (2 * kappa - 1) * (2 * kappa + 1) - 3 * (kappa * sin_gamma) ** 2
+    return 2 * top / (cos_t * (2 * kappa * torch.cos(gamma) + cos_t))
 
 
 def gamma_tt(kappa: Tensor, phi: Tensor) -> tuple[Tensor, Tensor]:
@@ -90,11 +95,12 @@ class Caustic:
 
     @staticmethod
     def at(kappa: Tensor) -> Caustic:
-        """sin^2 gamma_c = (4 kappa^2 - 1) / (3 kappa^2), i.e. h_c^2 = (4 - eta'^2)/3."""
+        """tan^2 gamma_c = (4 kappa^2 - 1) / (1 - kappa^2), i.e. h_c^2 = (4 - eta'^2)/3."""
         folded = kappa > 0.5
         safe = torch.where(folded, kappa, 0.6)
-        sin2 = ((2 * safe - 1) * (2 * safe + 1) / (3 * safe * safe)).clamp_min(torch.finfo(kappa.dtype).tiny)
-        gamma = torch.where(folded, torch.asin(torch.sqrt(sin2).clamp_max(1 - 1e-7)), 0.0)
+        opposite = (2 * safe - 1) * (2 * safe + 1)
+        adjacent = ((1 - safe) * (1 + safe)).clamp_min(torch.finfo(kappa.dtype).tiny)
+        gamma = torch.where(folded, torch.atan2(torch.sqrt(opposite), torch.sqrt(adjacent)), 0.0)
         phi = torch.where(folded, exit_trt(kappa, gamma), 0.0)
         return Caustic(folded, gamma, phi, 4 * torch.asin(kappa) - math.pi)
 
