@@ -45,6 +45,11 @@ def is_tracked(*tensors: Tensor) -> bool:
     return torch._C._functorch.peek_interpreter_stack() is not None
 
 
+def is_differentiated(tensor: Tensor) -> bool:
+    """Whether a derivative in this tensor is being asked for: `requires_grad`, or a tangent of forward mode."""
+    return tensor.requires_grad or torch.autograd.forward_ad.unpack_dual(tensor).tangent is not None
+
+
 def is_wrapped(tensor: Tensor) -> bool:
     """Whether the tensor belongs to a `torch.func` transform that is under way, and must not be kept beyond it."""
     return torch._C._functorch.is_functorch_wrapped_tensor(tensor)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from dsfit.errors import InputError, as_real, check_broadcast, check_choice, check_range, common_dtype
+from dsfit.special import is_differentiated
 
 _DEG = math.pi / 180
 
@@ -146,13 +147,13 @@ class Fiber:
 
     @property
     def requires_grad(self) -> bool:
-        """Whether any field is tracked by autograd."""
-        return any(value.requires_grad for value in self.parameters().values())
+        """Whether any field is tracked by autograd, in reverse or in forward mode."""
+        return any(is_differentiated(value) for value in self.parameters().values())
 
     @property
     def is_round(self) -> bool:
         """Whether the section is a circle, so that nothing depends on absolute azimuth."""
-        return not self.eccentricity.requires_grad and bool((self.eccentricity == 1).all())
+        return not is_differentiated(self.eccentricity) and bool((self.eccentricity == 1).all())
 
     def eta_trt(self, phi_h: Tensor | None) -> Tensor:
         """Index that TRT sees: eta* = [(eta1 + eta2) + cos(2 phi_h) (eta1 - eta2)] / 2 (Marschner et al. 2003,

@@ -104,6 +104,10 @@ class Caustic:
         phi = torch.where(folded, exit_trt(kappa, gamma), 0.0)
         return Caustic(folded, gamma, phi, 4 * torch.asin(kappa) - math.pi)
 
+    def detach(self) -> Caustic:
+        """The same values without derivatives."""
+        return Caustic(self.folded, self.gamma.detach(), self.phi.detach(), self.edge.detach())
+
 
 def root_falling(kappa: Tensor, caustic: Caustic, phi: Tensor) -> Tensor:
     """gamma in [gamma_c, pi/2] with f(gamma) = phi, for phi in [edge, phi_c]; out-of-range phi goes to the nearer end.
@@ -112,8 +116,10 @@ def root_falling(kappa: Tensor, caustic: Caustic, phi: Tensor) -> Tensor:
     three upper bounds on the root (linear, quadratic at the fold, cubic at kappa = 1/2), so it is good at the fold as
     well.
     """
+    whole, limits = kappa, caustic
     with torch.no_grad():
-        y = torch.minimum(torch.maximum(phi, caustic.edge), caustic.phi)
+        kappa, caustic = kappa.detach(), caustic.detach()  # forward mode looks through no_grad
+        y = torch.minimum(torch.maximum(phi.detach(), caustic.edge), caustic.phi)
         drop = caustic.phi - y
         bend = 4 * kappa * (1 - kappa * kappa)
         tiny = torch.finfo(kappa.dtype).tiny
@@ -127,15 +133,17 @@ def root_falling(kappa: Tensor, caustic: Caustic, phi: Tensor) -> Tensor:
             slope = exit_trt_slope(kappa, gamma).clamp_max(-torch.finfo(kappa.dtype).eps)
             step = (exit_trt(kappa, gamma) - y) / slope
             gamma = torch.minimum(torch.maximum(gamma - step, caustic.gamma), gamma)
-    return _attach(kappa, gamma, torch.minimum(torch.maximum(phi, caustic.edge), caustic.phi))
+    return _attach(whole, gamma, torch.minimum(torch.maximum(phi, limits.edge), limits.phi))
 
 
 def root_rising(kappa: Tensor, caustic: Caustic, phi: Tensor) -> Tensor:
     """gamma in [0, gamma_c] with f(gamma) = phi, for phi in [0, phi_c]; meaningful only where the fibre has a
     caustic.
     """
+    whole, limits = kappa, caustic
     with torch.no_grad():
-        y = torch.minimum(phi.clamp_min(0.0), caustic.phi)
+        kappa, caustic = kappa.detach(), caustic.detach()  # forward mode looks through no_grad
+        y = torch.minimum(phi.detach().clamp_min(0.0), caustic.phi)
         tiny = torch.finfo(kappa.dtype).tiny
         fold = 4 * kappa * (1 - kappa * kappa) * torch.sin(caustic.gamma)
         fold = fold / cos_refracted(kappa, torch.sin(caustic.gamma)) ** 3
@@ -143,7 +151,7 @@ def root_rising(kappa: Tensor, caustic: Caustic, phi: Tensor) -> Tensor:
         for _ in range(_NEWTON_STEPS):
             slope = exit_trt_slope(kappa, gamma).clamp_min(torch.finfo(kappa.dtype).eps)
             gamma = torch.minimum((gamma - (exit_trt(kappa, gamma) - y) / slope).clamp_min(0.0), caustic.gamma)
-    return _attach(kappa, gamma, torch.minimum(phi.clamp_min(0.0), caustic.phi))
+    return _attach(whole, gamma, torch.minimum(phi.clamp_min(0.0), limits.phi))
 
 
 def _attach(kappa: Tensor, gamma: Tensor, phi: Tensor) -> Tensor:
