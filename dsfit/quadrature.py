@@ -106,7 +106,8 @@ class PiecewiseChebyshev:
         low, high = self.low.to(x.dtype), self.high.to(x.dtype)
         x = x.clamp(float(self.low[0]), float(self.high[-1]))
         index = (torch.searchsorted(low, x.detach().contiguous(), right=True) - 1).clamp(0, self.panels - 1)
-        t = ((2 * x - low[index] - high[index]) / (high[index] - low[index])).unsqueeze(-1)
+        width = (high[index] - low[index]).clamp_min(torch.finfo(x.dtype).eps)  # the last panel is empty in float32
+        t = ((2 * x - low[index] - high[index]) / width).unsqueeze(-1)
         coefficients = self.coefficients.to(x.dtype)
         ahead: Tensor | float = 0.0
         current: Tensor = coefficients[-1][index]

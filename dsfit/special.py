@@ -67,7 +67,7 @@ def piecewise(branches: Sequence[Branch], *args: Tensor, base: Tensor | None = N
         if base is None and len(present) == 1:
             return present[0][1](*args)
         if not present:
-            return base
+            return branches[0][1](*args) if base is None else base  # without a base, there are no elements
         *args, _ = torch.broadcast_tensors(*args, present[0][0])
         flat, shape = [arg.reshape(-1) for arg in args], args[0].shape
         result = torch.zeros_like(flat[0]) if base is None else base.expand(shape).reshape(-1)

@@ -14,7 +14,7 @@ from dsfit.bsdf.conventions import Convention
 from dsfit.bsdf.fiber import Fiber
 from dsfit.bsdf.scattered import offset_windows
 from dsfit.bsdf.snell import Refraction
-from dsfit.frame import HALF_PI
+from dsfit.frame import HALF_PI, cos_inclination
 from dsfit.quadrature import PiecewiseChebyshev, graded_ends, merge_breaks, panel_points
 
 _ORIENTATION_NODES = 12
@@ -73,7 +73,7 @@ class LobeShares:
         """a_f^p and a_b^p, each `[..., 3, C]`."""
         scaled = self._shares(theta_in)
         scaled = scaled.reshape(*theta_in.shape, 2, 3, self.fiber.channels)
-        value = scaled * torch.cos(theta_in).clamp_min(0.0)[..., None, None, None]
+        value = scaled * cos_inclination(theta_in)[..., None, None, None]  # never 0: averages divide by shares
         return value.select(-3, 0), value.select(-3, 1)
 
     def _jumps(self) -> Tensor:

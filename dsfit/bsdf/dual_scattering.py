@@ -274,7 +274,7 @@ class DualScattering:
     def _inputs(self, theta_i: Any, theta_r: Any, phi: Any, n: Any, v: Any) -> tuple[Tensor, ...]:
         dtype, device = common_dtype("dtype", None, (theta_i, theta_r, phi, n, v, self.fiber.eta))
         names = {"theta_i": theta_i, "theta_r": theta_r, "phi": phi, "n": n, "v": v}
-        values = {k: as_real(k, x, dtype, device) for k, x in names.items() if x is not None}
+        values = {k: as_real(k, x, dtype, device) for k, x in names.items() if k != "v" or v is not None}
         if v is None:
             values["v"] = (values["n"] == 0).to(dtype)
         check_broadcast(**values)

@@ -62,6 +62,8 @@ class MixtureDistribution(Distribution):
             where = [torch.nonzero((choice == k).flatten())[:, 0] for k in range(len(self.components))]
         except RuntimeError:
             return self._sample_everywhere(u, choice)
+        if not choice.numel():
+            return self._sample_everywhere(u, choice)
         flat = u.reshape(-1, u.shape[-1])
         whole: dict[int, Tensor] = {}
         parts = []

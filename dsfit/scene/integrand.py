@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from dsfit.arguments import check_directions
 from dsfit.bsdf.azimuthal import support_edges
 from dsfit.bsdf.breaks import theta_breaks
 from dsfit.bsdf.dual_scattering import DualScattering
@@ -27,6 +28,9 @@ class Integrand:
 
     `integrand(omega_i, context)` takes directions `[*samples, *batch, 2]`. Channels of the BSDF and of the light must
     agree or be 1.
+
+    Raises:
+        InputError: channels that do not agree; directions not finite, or that do not broadcast with the context.
     """
 
     def __init__(self, bsdf: DualScattering, light: Light | None = None, scattering: Scattering | None = None) -> None:
@@ -49,6 +53,7 @@ class Integrand:
         return plain and self.bsdf.fiber.is_round
 
     def __call__(self, omega_i: Tensor, context: Context) -> Tensor:
+        check_directions(omega_i, context.batch_shape, "omega_i")
         theta_i, phi_i = omega_i.unbind(-1)
         n, v = self.scattering(omega_i, context)
         phi = wrap(context.phi_r - phi_i)
