@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsfit.errors import InputError, check_choice
+from dsfit.errors import InputError, as_number, check_choice
 
 
 def log_effective(log_p: Tensor, counts: Tensor) -> Tensor:
@@ -29,15 +29,24 @@ def log_effective(log_p: Tensor, counts: Tensor) -> Tensor:
     return log_p + torch.log(counts).reshape(-1, *[1] * (log_p.ndim - 1))
 
 
-def _normalise(log_q: Tensor, power: float = 1.0) -> Tensor:
-    """log(q_s^power / sum q^power), -inf where q_s = 0 or all are 0.
+def _relative(log_p: Tensor, counts: Tensor) -> Tensor:
+    """log(n_s p_s / top), top the largest density of a strategy with n_s > 0; -inf where q_s = 0.
 
-    Points where all are 0 are replaced before the sum, so that gradients stay finite; the largest is taken out first,
-    so that the rounding of the logs does not grow with their size.
+    The densities are divided first: next to a log in the thousands the digits of log n_s would be lost. Points where
+    all are 0 get a top of 1.
     """
-    top = log_q.detach().amax(dim=0)
-    alive = top > -torch.inf
-    scaled = power * torch.where(alive, log_q - torch.where(alive, top, 0.0), 0.0)
+    offered = torch.as_tensor(counts, dtype=log_p.dtype, device=log_p.device).reshape(-1, *[1] * (log_p.ndim - 1)) > 0
+    top = log_p.detach().masked_fill(~offered, -torch.inf).amax(dim=0)
+    return log_effective(log_p - torch.where(top > -torch.inf, top, 0.0), counts)
+
+
+def _normalise(log_q: Tensor, power: float = 1.0) -> Tensor:
+    """log(q_s^power / sum q^power), -inf where q_s = 0 or all are 0; log_q from `_relative`.
+
+    Points where all are 0 are replaced before the sum, so that gradients stay finite.
+    """
+    alive = log_q.detach().amax(dim=0) > -torch.inf
+    scaled = power * torch.where(alive, log_q, 0.0)
     return torch.where(alive, scaled - torch.logsumexp(scaled, dim=0), -torch.inf)
 
 
@@ -67,7 +76,7 @@ class Balance(Heuristic):
     """w_s = n_s p_s / sum_k n_k p_k (chapter eq 3; Veach 1997, section 9.2.2)."""
 
     def log_weights(self, log_p: Tensor, counts: Tensor) -> Tensor:
-        return _normalise(log_effective(log_p, counts))
+        return _normalise(_relative(log_p, counts))
 
 
 @dataclass(frozen=True)
@@ -77,11 +86,10 @@ class Power(Heuristic):
     beta: float = 2.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.beta < float("inf"):
-            raise InputError("heuristic.beta", self.beta, "a finite number > 0")
+        object.__setattr__(self, "beta", as_number("heuristic.beta", self.beta, 0.0, open_low=True))
 
     def log_weights(self, log_p: Tensor, counts: Tensor) -> Tensor:
-        return _normalise(log_effective(log_p, counts), self.beta)
+        return _normalise(_relative(log_p, counts), self.beta)
 
 
 @dataclass(frozen=True)
@@ -89,7 +97,7 @@ class Maximum(Heuristic):
     """w_s = 1 for the largest n_s p_s (Veach 1997, section 9.2.3); strategies that tie exactly share the weight."""
 
     def log_weights(self, log_p: Tensor, counts: Tensor) -> Tensor:
-        log_q = log_effective(log_p, counts)
+        log_q = _relative(log_p, counts)
         winner = (log_q == log_q.amax(dim=0)) & (log_q > -torch.inf)
         return torch.where(winner, -torch.log(winner.sum(dim=0).clamp_min(1).to(log_q.dtype)), -torch.inf)
 
@@ -104,11 +112,10 @@ class Cutoff(Heuristic):
     alpha: float = 0.1
 
     def __post_init__(self) -> None:
-        if not 0 <= self.alpha <= 1:
-            raise InputError("heuristic.alpha", self.alpha, "a number in [0, 1]")
+        object.__setattr__(self, "alpha", as_number("heuristic.alpha", self.alpha, 0.0, 1.0))
 
     def log_weights(self, log_p: Tensor, counts: Tensor) -> Tensor:
-        log_q = log_effective(log_p, counts)
+        log_q = _relative(log_p, counts)
         threshold = log_q.detach().amax(dim=0) + (math.log(self.alpha) if self.alpha > 0 else -math.inf)
         return _normalise(torch.where(log_q.detach() >= threshold, log_q, -torch.inf))
 
@@ -130,8 +137,8 @@ class Optimal(Heuristic):
     rcond: float | None = None
 
     def __post_init__(self) -> None:
-        if self.rcond is not None and not 0 <= self.rcond < 1:
-            raise InputError("heuristic.rcond", self.rcond, "a number in [0, 1)")
+        if self.rcond is not None:
+            object.__setattr__(self, "rcond", as_number("heuristic.rcond", self.rcond, 0.0, 1.0, open_high=True))
 
     def log_weights(self, log_p: Tensor, counts: Tensor) -> Tensor:
         raise InputError("heuristic", "optimal", "weights(log_p, counts, value, alpha): signed, per channel of F")

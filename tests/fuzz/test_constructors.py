@@ -63,15 +63,24 @@ def test_context(theta_r: Any, phi_r: Any, n: Any, v: Any, dtype: Any) -> None:
 
 
 @fuzz(150)
-@given(st.sampled_from(["consistent", "printed", "x", 3, None]), st.dictionaries(
-    st.sampled_from(["lobe_norm", "inverse_cos2", "density_power", "x"]), anything | st.just("energy"), max_size=2))
+@given(
+    st.sampled_from(["consistent", "printed", "x", 3, None]),
+    st.dictionaries(
+        st.sampled_from(["lobe_norm", "inverse_cos2", "density_power", "x"]), anything | st.just("energy"), max_size=2
+    ),
+)
 def test_convention(name: Any, switches: dict[str, Any]) -> None:
     attempt(Convention.named, name, **switches)
 
 
 @fuzz(150)
-@given(values, values, st.sampled_from(["marschner", "raw", "simplified", "x", None, 1.0]),
-       st.sampled_from(["exact", "table", "x", None]), tensors())
+@given(
+    values,
+    values,
+    st.sampled_from(["marschner", "raw", "simplified", "x", None, 1.0]),
+    st.sampled_from(["exact", "table", "x", None]),
+    tensors(),
+)
 def test_dual_scattering(d_f: Any, d_b: Any, azimuthal: Any, precision: Any, batch: Any) -> None:
     fiber = attempt(Fiber.preset, "blond", eta=batch)
     for one in (fiber, Fiber.preset("brown")):
@@ -111,8 +120,13 @@ def test_lobes_light(directions: Any, kappa: Any, intensity: Any, ambient: Any, 
     _light(VonMisesFisherLights, [0.3, 0.2], 20.0, rotation=rotation)
 
 
-images = st.tuples(st.integers(0, 4), st.integers(0, 4), st.integers(0, 3), st.lists(numbers, min_size=1, max_size=48),
-                   st.sampled_from([torch.float32, torch.float64, torch.float16, torch.int64, torch.complex64]))
+images = st.tuples(
+    st.integers(0, 4),
+    st.integers(0, 4),
+    st.integers(0, 3),
+    st.lists(numbers, min_size=1, max_size=48),
+    st.sampled_from([torch.float32, torch.float64, torch.float16, torch.int64, torch.complex64]),
+)
 
 
 @fuzz(250)
@@ -139,8 +153,9 @@ def _scattering(make: Any, *args: Any, **kwargs: Any) -> None:
 
 
 @fuzz(300)
-@given(values, values, values, values | vectors, values | st.sampled_from(["poisson", "threshold"]), values,
-       st.booleans())
+@given(
+    values, values, values, values | vectors, values | st.sampled_from(["poisson", "threshold"]), values, st.booleans()
+)
 def test_scattering(a: Any, b: Any, c: Any, vector: Any, v: Any, max_n: Any, aligned: bool) -> None:
     _scattering(ConstantScattering, a, v)
     _scattering(SlabScattering, a, b, c, vector, v, aligned=aligned, max_n=max_n)

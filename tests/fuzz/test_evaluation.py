@@ -26,7 +26,6 @@ from dsfit.proposals import (
     TransmittanceCosine,
     TruncatedGaussian,
     UniformAzimuth,
-    UniformSphere,
     WrappedGaussian,
     chapter_proposals,
 )
@@ -76,8 +75,9 @@ def _inclination(limit: float) -> st.SearchStrategy[float]:
 
 
 HALF_PI = torch.pi / 2
-contexts = st.tuples(_inclination(HALF_PI), st.floats(-4, 4), st.sampled_from([0.0, 1e-300, 1e4]) | st.floats(0, 50),
-                     st.none() | unit)
+contexts = st.tuples(
+    _inclination(HALF_PI), st.floats(-4, 4), st.sampled_from([0.0, 1e-300, 1e4]) | st.floats(0, 50), st.none() | unit
+)
 
 
 def make(one: tuple[float, float, float, float | None], dtype: torch.dtype = torch.float64) -> Context:
@@ -86,17 +86,20 @@ def make(one: tuple[float, float, float, float | None], dtype: torch.dtype = tor
     return Context(max(-limit, min(limit, theta_r)), phi_r, n, v, dtype=dtype)
 
 
-fibres = st.fixed_dictionaries({}, optional={
-    "sigma_a": st.lists(st.sampled_from([0.0, 1e-300, 1e4]) | st.floats(0, 20), min_size=1, max_size=3),
-    "eta": st.sampled_from([1.0001, 1.01, 3.0, 10.0]) | st.floats(1.05, 3),
-    "alpha": st.lists(st.floats(-1.5, 1.5), min_size=3, max_size=3),
-    "beta": st.lists(st.sampled_from([1e-4, 10.0]) | st.floats(1e-3, 2), min_size=3, max_size=3),
-    "caustic_width": st.sampled_from([1e-4, 3.1]) | st.floats(0.01, 3.0),
-    "glint_scale": st.sampled_from([0.0, 100.0]) | st.floats(0, 3),
-    "caustic_fade": st.floats(1e-3, 10),
-    "caustic_max_offset": unit,
-    "gamma_tt": st.sampled_from([1e-3, 50.0]) | st.floats(0.01, 4),
-})
+fibres = st.fixed_dictionaries(
+    {},
+    optional={
+        "sigma_a": st.lists(st.sampled_from([0.0, 1e-300, 1e4]) | st.floats(0, 20), min_size=1, max_size=3),
+        "eta": st.sampled_from([1.0001, 1.01, 3.0, 10.0]) | st.floats(1.05, 3),
+        "alpha": st.lists(st.floats(-1.5, 1.5), min_size=3, max_size=3),
+        "beta": st.lists(st.sampled_from([1e-4, 10.0]) | st.floats(1e-3, 2), min_size=3, max_size=3),
+        "caustic_width": st.sampled_from([1e-4, 3.1]) | st.floats(0.01, 3.0),
+        "glint_scale": st.sampled_from([0.0, 100.0]) | st.floats(0, 3),
+        "caustic_fade": st.floats(1e-3, 10),
+        "caustic_max_offset": unit,
+        "gamma_tt": st.sampled_from([1e-3, 50.0]) | st.floats(0.01, 4),
+    },
+)
 
 
 models = st.sampled_from(["marschner", "raw", "simplified"])
@@ -105,8 +108,14 @@ FLOATS = st.sampled_from([torch.float64, torch.float32])
 
 
 @fuzz(100)
-@given(fibres, models, named, st.lists(st.tuples(_inclination(HALF_PI), st.floats(-3.2, 3.2)), min_size=1, max_size=4),
-       st.none() | st.floats(-3.2, 3.2), FLOATS)
+@given(
+    fibres,
+    models,
+    named,
+    st.lists(st.tuples(_inclination(HALF_PI), st.floats(-3.2, 3.2)), min_size=1, max_size=4),
+    st.none() | st.floats(-3.2, 3.2),
+    FLOATS,
+)
 def test_azimuths_of_extreme_fibres(
     fields: dict[str, Any], model: str, convention: str, points: list[tuple[float, float]], phi_h: Any, dtype: Any
 ) -> None:
@@ -121,8 +130,14 @@ def test_azimuths_of_extreme_fibres(
 
 
 @fuzz(3)
-@given(fibres, models, named, contexts,
-       st.lists(st.tuples(_inclination(HALF_PI), st.floats(-3.2, 3.2)), min_size=1, max_size=5), FLOATS)
+@given(
+    fibres,
+    models,
+    named,
+    contexts,
+    st.lists(st.tuples(_inclination(HALF_PI), st.floats(-3.2, 3.2)), min_size=1, max_size=5),
+    FLOATS,
+)
 def test_extreme_fibres_are_finite_and_even(
     fields: dict[str, Any], model: str, convention: str, one: Any, omega: list[tuple[float, float]], dtype: Any
 ) -> None:
@@ -139,8 +154,13 @@ def test_extreme_fibres_are_finite_and_even(
 
 
 @fuzz(60)
-@given(st.sampled_from(list(BSDFS)), st.sampled_from(list(LIGHTS)), st.sampled_from(list(PLACES)),
-       contexts, tensors(numbers))
+@given(
+    st.sampled_from(list(BSDFS)),
+    st.sampled_from(list(LIGHTS)),
+    st.sampled_from(list(PLACES)),
+    contexts,
+    tensors(numbers),
+)
 def test_integrand_at_any_tensor(bsdf: str, light: str, place: str, one: Any, omega: Tensor) -> None:
     integrand = Integrand(BSDFS[bsdf], LIGHTS[light], PLACES[place])
     value = attempt(integrand, omega, make(one))
@@ -156,12 +176,21 @@ def _all() -> dict[str, Proposal]:
     found["mixture"] = Mixture([found["R"], found["back"], found["front"]], [1.0, 2.0, 1e-300])
     context = Context(torch.tensor([0.2, -1.0], dtype=torch.float64), 0.0, 3.0, 0.5)
     found["structured"] = StructuredProposal(bsdf, context)
-    azimuths = {"cos": CosineHalf(), "wrapped": WrappedGaussian(1e-3), "truncated": TruncatedGaussian(50.0),
-                "scattered": Scattered(WrappedGaussian(0.3)), "front": FrontHalf(), "TRT": OffsetAzimuth("TRT", 1.3)}
+    azimuths = {
+        "cos": CosineHalf(),
+        "wrapped": WrappedGaussian(1e-3),
+        "truncated": TruncatedGaussian(50.0),
+        "scattered": Scattered(WrappedGaussian(0.3)),
+        "front": FrontHalf(),
+        "TRT": OffsetAzimuth("TRT", 1.3),
+    }
     for k, azimuth in azimuths.items():
         found[f"narrow {k}"] = Product(GaussianLobe(1.5, 2e-5), azimuth)
-    laws = {"cauchy": CauchyLobe(-1.5, 2e-5), "split": SplitGaussianLobe(1.5, 2e-5, 90.0), "cosine":
-            TransmittanceCosine()}
+    laws = {
+        "cauchy": CauchyLobe(-1.5, 2e-5),
+        "split": SplitGaussianLobe(1.5, 2e-5, 90.0),
+        "cosine": TransmittanceCosine(),
+    }
     for k, law in laws.items():
         found[f"law {k}"] = Product(law, UniformAzimuth())
     found["lobe"] = Lobe("TT", 0.0, 99.0, 99.0, beta_f=0.1)
@@ -172,8 +201,7 @@ PROPOSALS = _all()
 
 
 @fuzz(250)
-@given(st.sampled_from(list(PROPOSALS)), contexts, tensors(numbers),
-       tensors(unit))
+@given(st.sampled_from(list(PROPOSALS)), contexts, tensors(numbers), tensors(unit))
 def test_proposal_at_any_tensor(name: str, one: Any, omega: Tensor, u: Tensor) -> None:
     distribution = PROPOSALS[name](make(one))
     value = attempt(distribution.log_prob, omega)
@@ -189,8 +217,12 @@ def test_proposal_at_any_tensor(name: str, one: Any, omega: Tensor, u: Tensor) -
 
 
 @fuzz(250)
-@given(st.sampled_from(list(PROPOSALS)), contexts, st.lists(unit, min_size=8, max_size=8),
-       st.sampled_from([torch.float64, torch.float32]))
+@given(
+    st.sampled_from(list(PROPOSALS)),
+    contexts,
+    st.lists(unit, min_size=8, max_size=8),
+    st.sampled_from([torch.float64, torch.float32]),
+)
 def test_every_uniform_gives_a_direction_with_its_density(name: str, one: Any, u: list[float], dtype: Any) -> None:
     context = make(one, dtype)
     distribution = PROPOSALS[name](context)
@@ -204,8 +236,11 @@ def test_every_uniform_gives_a_direction_with_its_density(name: str, one: Any, u
 
 
 @fuzz(120)
-@given(st.sampled_from(list(PROPOSALS)), st.lists(contexts, min_size=1, max_size=3),
-       st.lists(st.floats(0.001, 0.999), min_size=12, max_size=12))
+@given(
+    st.sampled_from(list(PROPOSALS)),
+    st.lists(contexts, min_size=1, max_size=3),
+    st.lists(st.floats(0.001, 0.999), min_size=12, max_size=12),
+)
 def test_a_batch_is_the_same_as_a_loop(name: str, batch: list[Any], u: list[float]) -> None:
     proposal = PROPOSALS[name]
     singles = [make(one) for one in batch]
@@ -231,8 +266,12 @@ def test_densities_are_even_in_the_relative_azimuth(name: str, one: Any, theta: 
 
 
 @fuzz(100)
-@given(st.sampled_from(["consistent", "printed"]), contexts, st.lists(contexts, min_size=1, max_size=3),
-       st.tuples(_inclination(1.5), st.floats(-3.1, 3.1)))
+@given(
+    st.sampled_from(["consistent", "printed"]),
+    contexts,
+    st.lists(contexts, min_size=1, max_size=3),
+    st.tuples(_inclination(1.5), st.floats(-3.1, 3.1)),
+)
 def test_a_batch_of_contexts_is_a_loop_for_the_integrand(
     convention: str, first: Any, rest: list[Any], omega: tuple[float, float]
 ) -> None:
