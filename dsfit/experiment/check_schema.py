@@ -28,7 +28,19 @@ class IndependentOptions(Section):
 
 
 class FurnaceOptions(Section):
-    """`[check.furnace]`."""
+    """`[check.furnace]`: inclinations of the viewer, scattering fibres where the scene leaves them open, directions per
+    proposal and inclination, and equal cells in theta_i and in phi."""
+
+    inclinations_deg: Annotated[list[Annotated[float, Field(ge=-90, le=90)]], Field(min_length=1)] = [
+        0.0,
+        -50.0,
+        75.0,
+        89.9,
+    ]
+    n: Annotated[list[Annotated[float, Field(ge=0)]], Field(min_length=1)] = [0.0, 3.0]
+    samples: Annotated[int, Field(ge=1000, le=10**8)] = 8192
+    rings: Annotated[int, Field(ge=2, le=720)] = 36
+    wedges: Annotated[int, Field(ge=1, le=720)] = 8
 
 
 class GradientsOptions(Section):
