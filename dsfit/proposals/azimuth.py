@@ -30,6 +30,16 @@ def _clamp_open(u: Tensor) -> Tensor:
     return u.clamp(torch.finfo(u.dtype).tiny, 1 - torch.finfo(u.dtype).eps / 2)
 
 
+_PI_TAIL = {torch.float64: 1.2246467991473532e-16, torch.float32: -8.742277657347586e-08}
+"""What pi has beyond its rounding to the dtype."""
+
+
+def _from_forward(phi: Tensor) -> Tensor:
+    """Distance `pi - |phi|` from the forward direction, with all digits where phi is next to pi: narrow laws need
+    them."""
+    return (math.pi - phi.abs()) + _PI_TAIL[phi.dtype]
+
+
 @dataclass(frozen=True)
 class CosineHalfLaw(BatchFields, AzimuthalDistribution):
     """`p(phi) = cos(phi / 2) / 4`; see `CosineHalf`."""
@@ -72,7 +82,7 @@ class WrappedGaussianLaw(BatchFields, AzimuthalDistribution):
         return wrap(math.pi - self.std * torch.special.ndtri(_clamp_open(u[..., 0])))
 
     def log_prob(self, phi: Tensor, theta_i: Tensor) -> Tensor:
-        return wrapped_normal_log_prob(math.pi - phi, self.std)
+        return wrapped_normal_log_prob(_from_forward(phi), self.std)
 
     def scattered_log_prob(self, phi: Tensor, theta_i: Tensor) -> Tensor:
         """`(1/pi) sum_k [Phi((d + pi/2 + 2 pi k) / std) - Phi((d - pi/2 + 2 pi k) / std)]`, d = wrap(phi - pi).
@@ -80,7 +90,7 @@ class WrappedGaussianLaw(BatchFields, AzimuthalDistribution):
         Above std = 0.9 by its Fourier series: `1 / 2 pi` times `1 + 2 sum_k e^{-k^2 std^2 / 2} cos(k d) s_k` with
         `s_k = sin(k pi/2) / (k pi/2)`.
         """
-        d = wrap(phi - math.pi).abs()
+        d = _from_forward(phi).abs()
         narrow, wide = self.std < _NARROW[phi.dtype], self.std > 0.9
         branches: list[Branch] = [
             (~(narrow | wide), _scattered_by_erfc, (0.0, 0.5)),
@@ -150,11 +160,11 @@ class TruncatedGaussianLaw(BatchFields, AzimuthalDistribution):
 
     def log_prob(self, phi: Tensor, theta_i: Tensor) -> Tensor:
         zero, low, high = self._ends()
-        return truncated_normal_log_prob(wrap(math.pi - phi).clamp(-math.pi, math.pi), zero, self.std, low, high)
+        return truncated_normal_log_prob(_from_forward(phi).clamp(-math.pi, math.pi), zero, self.std, low, high)
 
     def scattered_log_prob(self, phi: Tensor, theta_i: Tensor) -> Tensor:
         """The mass of x in the half circle about d = |wrap(phi - pi)|, over pi: one interval, or two once d > pi/2."""
-        d, s = wrap(phi - math.pi).abs(), self.std
+        d, s = _from_forward(phi).abs(), self.std
         _, low, high = self._ends()
         main = log_normal_mass((d - HALF_PI) / s, torch.minimum(d + HALF_PI, high) / s)
         split = d > HALF_PI

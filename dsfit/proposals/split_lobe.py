@@ -11,6 +11,7 @@ from torch import Tensor
 from dsfit.context import Context
 from dsfit.frame import reachable
 from dsfit.proposals.base import BatchFields, Longitudinal, LongitudinalDistribution
+from dsfit.proposals.inclination import to_theta_i
 from dsfit.proposals.parameters import MEAN_BOUNDS, STD_BOUNDS, Bounded
 from dsfit.special import log_normal_mass, truncated_normal_icdf
 
@@ -48,14 +49,17 @@ class SplitGaussianInclination(BatchFields, LongitudinalDistribution):
 
     def sample(self, u: Tensor) -> Tensor:
         low, high, split, left, right = self._masses()
-        share = torch.exp(left - torch.logaddexp(left, right))
+        whole = torch.logaddexp(left, right)
+        share, rest = torch.exp(left - whole), torch.exp(right - whole)
         on_left = u < share
         tiny = torch.finfo(u.dtype).tiny
-        inner = torch.where(on_left, u / share.clamp_min(tiny), (u - share) / (1 - share).clamp_min(tiny))
+        # The upper piece is drawn mirrored, from 1 - u: the tails of both keep all digits of the uniform.
+        inner = torch.where(on_left, u / share.clamp_min(tiny), (1 - u) / rest.clamp_min(tiny))
+        side = torch.where(on_left, 1.0, -1.0).to(u.dtype)
         std = torch.where(on_left, self.below, self.above)
-        start, end = torch.where(on_left, low, split), torch.where(on_left, split, high)
-        theta_h = truncated_normal_icdf(inner.clamp(0, 1), self.mode.expand_as(std), std, start, end)
-        return (2 * theta_h - self.theta_r).clamp(-math.pi / 2, math.pi / 2)
+        start, end = torch.where(on_left, low, -high), torch.where(on_left, split, -split)
+        theta_h = side * truncated_normal_icdf(inner.clamp_max(1), side * self.mode, std, start, end)
+        return to_theta_i("half", theta_h, self.theta_r)
 
 
 class SplitGaussianLobe(Longitudinal):

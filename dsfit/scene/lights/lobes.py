@@ -205,7 +205,11 @@ class LobesDistribution(LightDistribution):
             axis = axis.squeeze(-2)
         safe = kappa.clamp_min(1e-20)  # the formula is exact down to there; at 0 it is 0/0
         # w = 1 - cos(angle to the axis): inverse CDF of exp(-kappa w) on [0, 2].
-        w = (-torch.log1p(u[..., 1] * torch.expm1(-2 * safe)) / safe).clamp(0.0, 2.0)
+        # By the smaller of u and 1 - u where that matters, so that the far side keeps the digits of the uniform too.
+        v = u[..., 1]
+        upper = (v > 0.5) & (safe > 1)
+        below = torch.log1p(torch.where(upper, 0.5, v) * torch.expm1(-2 * safe))
+        w = (-torch.where(upper, torch.log((1 - v) + v * torch.exp(-2 * safe)), below) / safe).clamp(0.0, 2.0)
         sine = torch.sqrt((w * (2 - w)).clamp_min(torch.finfo(dtype).tiny))
         psi = 2 * math.pi * u[..., 2]
         first, second = orthonormal(axis)
