@@ -52,6 +52,7 @@ class Function:
         logarithm: the value is the log of a density, whose absolute error is the relative error of the density.
         scale: a point's size below which an error counts as absolute (arguments, exact value -> size); 0 if left
             out. For functions that cross zero, where no relative error can be small.
+        gradient_scale: the same for derivatives, in every argument, on top of the rule below.
         density: negative values are faults.
         limits: largest relative error that is accepted, by dtype name: of the value, and of the gradient.
         loose: limits of single regimes, or of classes of them, where the mathematics gives away more; say why.
@@ -60,8 +61,8 @@ class Function:
     that the rounding of a large logarithm is not held against the code. Derivative in x_k: relative to
     `max(|d_k|, 1e-3 max_j |d_j| u_j / u_k)`, `u = max(|x|, 1e-3)`: one that is a thousand times smaller than another,
     per relative change of the argument, counts as zero. Exact values outside the dtype's normal range may be rounded to
-    0 or inf. A twin returns `mpmath.nan` for points that rounding has put outside the function's domain; these are
-    left out. Not a number, an infinity or zero in place of a number, or a negative density count as an infinite error.
+    0 or inf. A twin returns `mpmath.nan` (or an infinity) for points that rounding has put outside the function's
+    domain; these are left out. NaN, an infinity in place of a number, or a negative density count as an infinite error.
     """
 
     name: str
@@ -73,6 +74,7 @@ class Function:
     naive: Callable[..., Tensor] | None = None
     logarithm: bool = False
     scale: Callable[..., float] | None = None
+    gradient_scale: Callable[..., float] | None = None
     density: bool = False
     limits: Mapping[str, tuple[float, float]] = field(
         default_factory=lambda: {"float64": (1e-11, 1e-8), "float32": (1e-4, 1e-3)}
