@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +15,7 @@ from dsfit.frame import HALF_PI, cos_inclination, wrap
 from dsfit.proposals.base import Distribution
 
 _NARROWEST = 1e-7  # radians; a law that is narrower than this has all its mass in one cell
-_RINGS, _SECTORS = 48, 17  # quantiles in theta and in phi where the integration starts
+_RINGS, _SECTORS = 24, 9  # quantiles in theta and in phi where the integration starts
 _GROWTH = 3.0
 
 
@@ -85,7 +86,7 @@ def cell_masses(
     distribution: Distribution,
     context: Context,
     grid: CellGrid,
-    pilot: Tensor,
+    pilots: Sequence[Tensor],
     *,
     rtol: float = 1e-6,
     max_evaluations: int = 4_000_000,
@@ -99,12 +100,13 @@ def cell_masses(
         distribution: for a single context.
         context: that context.
         grid: the cells.
-        pilot: directions `[N, 2]` of the same law: they tell the integration where to look first.
+        pilots: directions `[N, 2]`, first of the same law, then of parts of it that are too rare to be found among the
+            first: they tell the integration where to look.
         rtol: wanted error of the total mass.
         max_evaluations: of log_prob; beyond it the error bounds say what was reached.
     """
-    breaks = _panels(grid.theta, pilot[:, 0], _RINGS)
-    columns = _panels(grid.phi, wrap(context.phi_r - pilot[:, 1]), _SECTORS)
+    breaks = _panels(grid.theta, [x[:, 0] for x in pilots], _RINGS)
+    columns = _panels(grid.phi, [wrap(context.phi_r - x[:, 1]) for x in pilots], _SECTORS)
 
     def density(theta: Tensor, phi: Tensor) -> Tensor:
         omega = torch.stack([theta, wrap(context.phi_r - phi)], dim=-1).reshape(-1, 2).to(context.dtype)
@@ -120,12 +122,16 @@ def cell_masses(
     return CellMasses(sums[0].reshape(grid.shape), sums[1].reshape(grid.shape), found.converged)
 
 
-def _panels(edges: Tensor, pilot: Tensor, count: int) -> Tensor:
-    """Where the integration starts: the cells' edges, quantiles of a pilot, and panels that grow away from where it is
-    dense, so that the tails beyond the last pilot sample are seen too."""
-    # the first and last order statistics tell how abruptly the law ends
-    ends = 2.0 ** torch.arange(0, 8, dtype=torch.float64) / len(pilot)
-    start = _quantiles(pilot, torch.cat([torch.linspace(0, 1, count, dtype=torch.float64), ends, 1 - ends]))
+def _panels(edges: Tensor, pilots: Sequence[Tensor], count: int) -> Tensor:
+    """Where the integration starts: the cells' edges, quantiles of the pilots, and panels that grow away from where
+    they are dense, so that the tails beyond the last pilot sample are seen too."""
+    starts = []
+    for k, pilot in enumerate(pilots):
+        inner = torch.linspace(0, 1, count if k == 0 else 5, dtype=torch.float64)
+        # the first and last order statistics tell how abruptly the law ends
+        ends = 4.0 ** torch.arange(0, 4 if k == 0 else 0, dtype=torch.float64) / len(pilot)
+        starts.append(_quantiles(pilot, torch.cat([inner, ends, 1 - ends])))
+    start = torch.cat(starts)
     apart = (start[:, None] - edges).abs().min(dim=1).values > _NARROWEST
     found = _distinct(torch.cat([start[apart], edges]), float(edges[0]), float(edges[-1]))
     # `_distinct` drops the later of two that are close, so the cells' own edges are put back

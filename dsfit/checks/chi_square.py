@@ -20,7 +20,8 @@ from dsfit.checks.subject import Outcome, Say, Subject, silent
 from dsfit.context import Context
 from dsfit.errors import InputError
 from dsfit.frame import HALF_PI, wrap
-from dsfit.proposals.base import Proposal
+from dsfit.proposals.base import Distribution, Proposal
+from dsfit.proposals.mixture import MixtureDistribution
 from dsfit.random import uniforms
 
 SUITE = "chi_square"
@@ -131,7 +132,8 @@ def chi_square(
             invalid += int((~good).sum())
             omega = omega[good]
             observed += grid.count(omega[:, 0], wrap(context.phi_r - omega[:, 1]))
-        found = cell_masses(distribution, context, grid, pilot, rtol=rtol)
+        pilots = [pilot, *_rare_parts(distribution, generator, context.dtype)]
+        found = cell_masses(distribution, context, grid, pilots, rtol=rtol)
     mass = float(found.mass.sum())
     expected = found.mass * (float(observed.sum()) / mass) if mass > 0 else found.mass
     p_value, statistic, degrees = pooled_chi_square(observed, expected)
@@ -149,6 +151,19 @@ def chi_square(
         expected=expected,
         blur=blur,
     )
+
+
+def _rare_parts(distribution: Distribution, generator: torch.Generator, dtype: torch.dtype) -> list[Tensor]:
+    """Directions of a mixture's components that a pilot of the whole hardly sees."""
+    if not isinstance(distribution, MixtureDistribution):
+        return []
+    found = []
+    for component, share in zip(distribution.components, distribution.log_weights.exp().unbind(-1), strict=True):
+        if float(share) < 40 / _PILOT:
+            omega = component.sample(uniforms((256,), component.dimension, generator=generator, dtype=dtype))
+            found.append(omega[_valid(omega)])
+        found += _rare_parts(component, generator, dtype)
+    return [omega for omega in found if len(omega)]
 
 
 def _valid(omega: Tensor) -> Tensor:

@@ -31,6 +31,7 @@ class Suite:
 
 SUITES: dict[str, Suite] = {
     "chi_square": Suite("dsfit.checks.chi_square", "context", "samples against the cell-integrated density"),
+    "unbiased": Suite("dsfit.checks.unbiased", "context", "every estimator against the quadrature"),
     "independent": Suite("dsfit.checks.independent", "context", "ensemble MCMC against resampling"),
     "furnace": Suite("dsfit.checks.furnace", "scene", "energy, ring light, limits, reciprocity"),
     "gradients": Suite("dsfit.checks.gradients", "context", "derivatives, and gradients of the variance"),

@@ -9,9 +9,10 @@ from pydantic import Field
 from dsfit.experiment.sections import Section
 
 SuiteName = Literal[
-    "chi_square", "independent", "furnace", "gradients", "stability", "stiff_fits", "controls", "faults"
+    "chi_square", "unbiased", "independent", "furnace", "gradients", "stability", "stiff_fits", "controls", "faults"
 ]
 Level = Annotated[float, Field(gt=0, lt=1)]
+HeuristicName = Literal["balance", "power", "maximum", "cutoff", "optimal"]
 Count = Annotated[int, Field(ge=1)]
 Names = Literal["all"] | Annotated[list[str], Field(min_length=1)]
 
@@ -21,6 +22,16 @@ class ChiSquareOptions(Section):
 
     samples: Annotated[int, Field(ge=100, le=10**8)] = 100_000
     cells: Annotated[list[Annotated[int, Field(ge=1, le=1000)]], Field(min_length=2, max_length=2)] = [24, 16]
+
+
+class UnbiasedOptions(Section):
+    """`[check.unbiased]`: samples of each estimate, MIS heuristics, and tolerance of the reference."""
+
+    samples: Annotated[int, Field(ge=1000, le=10**8)] = 40_000
+    heuristics: Annotated[list[HeuristicName], Field(min_length=1)] = [
+        "balance", "power", "maximum", "cutoff", "optimal",
+    ]  # fmt: skip
+    rtol: Annotated[float, Field(gt=0, le=1e-3)] = 1e-5
 
 
 class IndependentOptions(Section):
@@ -81,12 +92,13 @@ class CheckConfig(Section):
     `module:name` that take (integrand, context) and return a proposal.
     """
 
-    suites: Annotated[list[SuiteName], Field(min_length=1)] = ["chi_square", "independent", "furnace", "gradients"]
+    suites: Annotated[list[SuiteName], Field(min_length=1)] = ["chi_square", "unbiased", "independent", "furnace", "gradients"]
     level: Level = 0.01
     proposals: Names = "all"
     saved: list[str] = []
     user: list[str] = []
     chi_square: ChiSquareOptions = ChiSquareOptions()
+    unbiased: UnbiasedOptions = UnbiasedOptions()
     independent: IndependentOptions = IndependentOptions()
     furnace: FurnaceOptions = FurnaceOptions()
     gradients: GradientsOptions = GradientsOptions()
