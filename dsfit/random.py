@@ -73,6 +73,8 @@ def uniform_chunks(
         raise InputError("uniforms.generator", generator, "a torch.Generator")
     if dtype not in (torch.float32, torch.float64):
         raise InputError("uniforms.dtype", dtype, "torch.float32 or torch.float64")
+    if not isinstance(shape, Sequence):
+        raise InputError("uniforms.shape", shape, "a sequence of integers >= 0, the number of points first")
     shape = tuple(shape)
     if not shape or any(isinstance(n, bool) or not isinstance(n, int) or n < 0 for n in shape):
         raise InputError("uniforms.shape", shape, "one or more integers >= 0, the number of points first")

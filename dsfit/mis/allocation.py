@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from dsfit.context import Context
-from dsfit.errors import InputError, check_choice
+from dsfit.errors import InputError, as_number, as_real, check_choice
 from dsfit.mis.estimators import IntegrandFunction, draw, evaluate
 from dsfit.mis.heuristics import Heuristic
 from dsfit.mis.variance import best_fractions
@@ -38,6 +38,12 @@ class OptimalAllocation:
     def __post_init__(self) -> None:
         if isinstance(self.pilot, bool) or not isinstance(self.pilot, int) or self.pilot < 2:
             raise InputError("allocation.pilot", self.pilot, "an integer >= 2")
+        if self.costs is not None:
+            costs = as_real("allocation.costs", self.costs, torch.float64)
+            if costs.ndim != 1 or not bool((costs > 0).all()):
+                raise InputError("allocation.costs", self.costs, "a list of numbers > 0")
+            object.__setattr__(self, "costs", tuple(costs.tolist()))
+        object.__setattr__(self, "minimum", as_number("allocation.minimum", self.minimum, 0.0, 1.0))
 
 
 def parse_allocation(allocation: Any, strategies: int, samples: int) -> list[float] | OptimalAllocation:
@@ -72,11 +78,10 @@ def parse_allocation(allocation: Any, strategies: int, samples: int) -> list[flo
         if allocation == "equal":
             return [1 / strategies] * strategies
         if allocation == "optimal":
-            costs = options.pop("costs", None)
-            return OptimalAllocation(**options, costs=None if costs is None else tuple(float(c) for c in costs))
+            return OptimalAllocation(**options)
         weights = _numbers("allocation.weights", options.get("weights", ()), strategies)
         return [w / sum(weights) for w in weights]
-    given = list(allocation.tolist() if isinstance(allocation, Tensor) else allocation)
+    given = allocation.tolist() if hasattr(allocation, "tolist") else allocation
     numbers = _numbers("allocation", given, strategies)
     whole = all(isinstance(n, int) for n in given)
     if (whole and sum(numbers) != samples) or (not whole and not math.isclose(sum(numbers), 1.0, rel_tol=1e-6)):
@@ -85,10 +90,11 @@ def parse_allocation(allocation: Any, strategies: int, samples: int) -> list[flo
 
 
 def _numbers(field: str, values: Any, size: int) -> list[float]:
-    values = list(values)
-    if len(values) != size or not all(math.isfinite(v) and v >= 0 for v in values) or sum(values) <= 0:
-        raise InputError(field, values, f"{size} finite numbers >= 0, one for each strategy, not all 0")
-    return [float(v) for v in values]
+    allowed = f"{size} finite numbers >= 0, one for each strategy, not all 0"
+    numbers = as_real(field, values, torch.float64)
+    if numbers.shape != (size,) or not bool((numbers >= 0).all()) or not 0 < float(numbers.sum()) < math.inf:
+        raise InputError(field, values, allowed)
+    return numbers.tolist()
 
 
 def split_counts(samples: int, fractions: Sequence[float]) -> list[int]:

@@ -16,17 +16,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsfit.errors import InputError, as_number, check_choice
+from dsfit.errors import InputError, as_number, as_real, check_choice
 
 
 def log_effective(log_p: Tensor, counts: Tensor) -> Tensor:
     """log(n_s p_s) `[S, ...]` from log densities `[S, ...]` and counts (or fractions) `[S]`; checks the counts."""
-    counts = torch.as_tensor(counts, dtype=log_p.dtype, device=log_p.device)
-    if counts.shape != log_p.shape[:1]:
-        raise InputError("counts", tuple(counts.shape), f"one count for each of {log_p.shape[0]} strategies")
+    return log_p + torch.log(_checked(log_p, counts))
+
+
+def _checked(log_p: Tensor, counts: Tensor) -> Tensor:
+    """The counts `[S, 1, ...]` in the dtype of the log densities."""
+    counts = as_real("counts", counts, log_p.dtype, log_p.device)
+    if counts.shape != log_p.shape[:1] or not len(counts):
+        raise InputError("counts", tuple(counts.shape), f"one count for each of {len(log_p)} strategies, at least one")
     if not bool((torch.isfinite(counts) & (counts >= 0)).all()) or not bool((counts > 0).any()):
         raise InputError("counts", counts.tolist(), "finite numbers >= 0, at least one of them positive")
-    return log_p + torch.log(counts).reshape(-1, *[1] * (log_p.ndim - 1))
+    return counts.reshape(-1, *[1] * (log_p.ndim - 1))
 
 
 def _relative(log_p: Tensor, counts: Tensor) -> Tensor:
@@ -35,9 +40,10 @@ def _relative(log_p: Tensor, counts: Tensor) -> Tensor:
     The densities are divided first: next to a log in the thousands the digits of log n_s would be lost. Points where
     all are 0 get a top of 1.
     """
-    offered = torch.as_tensor(counts, dtype=log_p.dtype, device=log_p.device).reshape(-1, *[1] * (log_p.ndim - 1)) > 0
-    top = log_p.detach().masked_fill(~offered, -torch.inf).amax(dim=0)
-    return log_effective(log_p - torch.where(top > -torch.inf, top, 0.0), counts)
+    counts = _checked(log_p, counts)
+    log_p = torch.where(counts > 0, log_p, -torch.inf)
+    top = log_p.detach().amax(dim=0)
+    return log_p - torch.where(top > -torch.inf, top, 0.0) + torch.log(torch.where(counts > 0, counts, 1.0))
 
 
 def _normalise(log_q: Tensor, power: float = 1.0) -> Tensor:

@@ -1,4 +1,4 @@
-"""Configs: any bytes, any TOML, any damage to a valid config is a config or one error that names file, key and value."""
+"""Configs: any bytes, TOML or damage to a valid config give a config or one error naming file, key and value."""
 
 from __future__ import annotations
 
