@@ -35,7 +35,12 @@ class UnbiasedOptions(Section):
 
 
 class IndependentOptions(Section):
-    """`[check.independent]`: ensembles of walkers that draw from |F| / int |F|."""
+    """`[check.independent]`: ensembles of walkers that draw from |F| / int |F|, and directions of each proposal."""
+
+    ensembles: Annotated[int, Field(ge=4, le=1000, multiple_of=2)] = 16
+    walkers: Annotated[int, Field(ge=8, le=10_000, multiple_of=2)] = 32
+    steps: Annotated[int, Field(ge=20, le=10**6)] = 300
+    samples: Annotated[int, Field(ge=1000, le=10**7)] = 32_768
 
 
 class FurnaceOptions(Section):
