@@ -16,7 +16,7 @@ from scipy import stats
 
 import dsfit
 from dsfit.bsdf.conventions import Convention
-from dsfit.checks.controls import CONTROLS, TYPOS, first_equation, parts, run, trial
+from dsfit.checks.controls import CONTROLS, TYPOS, parts, position, run, trial
 from dsfit.checks.controls.base import Control, Trial
 from dsfit.checks.controls.energy import energy_gap, outgoing_energy, remainder, smooth_bsdf
 from dsfit.checks.controls.scene import DEG, THETA_R, bsdf, context, integrand, nodes, terms
@@ -89,7 +89,7 @@ def test_every_wrong_equation_is_covered() -> None:
     for item in (*CONTROLS.values(), *TYPOS):
         named |= {int(x) for x in re.findall(r"\((\d+)\)", item.equations)}
     assert set(range(1, 39)) - named == {1, 2, 3, 26, 27, 28, 29, 30}
-    assert [first_equation(c) for c in CONTROLS.values()] == sorted(first_equation(c) for c in CONTROLS.values())
+    assert [position(c) for c in CONTROLS.values()] == sorted(position(c) for c in CONTROLS.values())
 
 
 def test_equations_26_to_30_are_right() -> None:
@@ -159,6 +159,12 @@ def test_lost_cosines_agree_with_the_conventions_own_reference() -> None:
     ratio = [float(dsfit.reference(dsfit.Integrand(b), context(), 1e-4).value) for b in (wrong, bsdf())]
     both = tried("projection").data["ratio"] + tried("back_projection").data["ratio"] - 1
     assert both == pytest.approx(ratio[0] / ratio[1], rel=1e-3)
+
+
+def test_negative_light_agrees_with_the_printed_conventions_own_reference() -> None:
+    wrong = dsfit.Integrand(bsdf().replace(convention="printed", precision="exact"))
+    values = [float(dsfit.reference(scene, context(), 1e-3).value) for scene in (wrong, integrand())]
+    assert tried("all_together").data["integral_ratio"] == pytest.approx(values[0] / values[1], rel=5e-3)
 
 
 def test_energy_of_a_smooth_fibre() -> None:

@@ -14,23 +14,28 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from dsfit.checks.controls import azimuth, longitudinal, scattering, transmittance
+from dsfit.checks.controls import azimuth, backscatter, longitudinal, scattering, transmittance
 from dsfit.checks.controls.base import SUITE, Control, Trial, Typo
 from dsfit.checks.controls.scene import SCENE
 from dsfit.checks.subject import Outcome, Say, silent
 from dsfit.errors import check_choice
 
 
-def first_equation(item: Control | Typo) -> int:
-    """The first number of an erratum's equations, by which tables are sorted."""
-    return int(re.findall(r"\d+", item.equations)[0])
+def position(item: Control | Typo) -> float:
+    """Where an erratum stands in tables: at its first equation, or after all of a range such as "(4)–(12)"."""
+    numbers = [int(x) for x in re.findall(r"\d+", item.equations)]
+    return numbers[1] + 0.5 if "–" in item.equations else numbers[0]
 
 
 CONTROLS: dict[str, Control] = {
     control.name: control
     for control in sorted(
-        [c for module in (scattering, longitudinal, azimuth, transmittance) for c in module.CONTROLS.values()],
-        key=first_equation,
+        [
+            c
+            for module in (scattering, backscatter, longitudinal, azimuth, transmittance)
+            for c in module.CONTROLS.values()
+        ],
+        key=position,
     )
 }
 """Errata with an effect, by name."""
@@ -74,4 +79,4 @@ def run(part: str, *, seed: int, say: Say = silent, controls: Any = "all") -> Ou
     return Outcome(control.findings(control.trial(seed)))
 
 
-__all__ = ["CONTROLS", "SCENE", "SUITE", "TYPOS", "Control", "Trial", "Typo", "first_equation", "parts", "run", "trial"]
+__all__ = ["CONTROLS", "SCENE", "SUITE", "TYPOS", "Control", "Trial", "Typo", "parts", "position", "run", "trial"]

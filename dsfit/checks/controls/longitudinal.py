@@ -9,9 +9,9 @@ from scipy.stats import norm
 
 from dsfit.checks.controls.base import Registry, Trial
 from dsfit.checks.controls.samplers import AngularSlip, ClampSlip, CorrectedLobe, MirrorSlip, mass_gap, sampler_test
-from dsfit.checks.controls.scene import DEG, THETA_R, blond, number
-from dsfit.frame import HALF_PI
-from dsfit.proposals.printed import box_muller
+from dsfit.checks.controls.scene import DEG, THETA_R, blond, number, terms
+from dsfit.frame import HALF_PI, cos_inclination
+from dsfit.proposals.printed import LobeAsPrinted, box_muller
 
 CONTROLS = Registry()
 MASS_BOUND = 1e-5
@@ -126,9 +126,29 @@ def mirror_angle(seed: int) -> Trial:
 )
 def angular_density(seed: int) -> Trial:
     alpha, beta = _lobe("R")
-    printed, corrected = (
-        sampler_test(law(alpha, beta), THETA_R, seed) for law in (AngularSlip, CorrectedLobe)
-    )
+    printed, corrected = (sampler_test(law(alpha, beta), THETA_R, seed) for law in (AngularSlip, CorrectedLobe))
     normal = sampler_test(AngularSlip(alpha, beta), 0.0, seed).mass
     effect = f"mass {printed.mass:.2f}, and {normal:.2f} at θ_r = 0"
     return Trial(mass_gap(printed), mass_gap(corrected), MASS_BOUND, effect, {"mass": printed.mass, "normal": normal})
+
+
+@CONTROLS.add(
+    "lobe_together",
+    "(16)–(20)",
+    printed="all of them at once, as in figure 2",
+    corrected="M_R as above",
+    kind="bias",
+    check=MASS,
+)
+def lobe_together(seed: int) -> Trial:
+    """theta_i - 2 alpha is Gaussian, cut off at theta_max, with density g / (2 pi cos theta_i) per steradian; g is
+    claimed."""
+    alpha, beta = _lobe("R")
+    laws = (LobeAsPrinted(alpha, beta), CorrectedLobe(alpha, beta))
+    printed, corrected = (sampler_test(law, THETA_R, seed) for law in laws)
+    scene = terms()
+    drawn = (scene.theta_i - 2 * alpha).abs() <= HALF_PI - abs(THETA_R / 2 - alpha)
+    value = scene.weight * scene.total / (2 * math.pi * cos_inclination(scene.theta_i))
+    found = float(value[drawn].sum()) / scene.integral()
+    effect = f"estimates of the scene tend to ×{found:.3f}"
+    return Trial(mass_gap(printed), mass_gap(corrected), MASS_BOUND, effect, {"ratio": found, "mass": printed.mass})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from dsfit.checks.controls import CONTROLS, SCENE, TYPOS, Control, Typo, first_equation
+from dsfit.checks.controls import CONTROLS, SCENE, TYPOS, Control, Typo, position
 
 HEADER = "| equation | printed | corrected | measured effect | caught by |\n|---|---|---|---|---|"
 
@@ -22,7 +22,7 @@ def errata_table(effects: Mapping[str, str]) -> str:
     """
     items: list[Control | Typo] = [*(c for c in CONTROLS.values() if c.name in effects), *TYPOS]
     lines = [f"Measured in: {SCENE}, if not said otherwise. ×: integral as printed over the right one.", "", HEADER]
-    for item in sorted(items, key=first_equation):
+    for item in sorted(items, key=position):
         if isinstance(item, Control):
             effect, check = f"{item.kind}: {effects[item.name]}", f"{item.check} (`{item.name}`)"
         else:

@@ -7,13 +7,14 @@ from collections.abc import Iterator
 from typing import Any
 
 from matplotlib.figure import Figure
-from matplotlib.ticker import ScalarFormatter
+from matplotlib.ticker import NullLocator
 
 from dsfit.checks.controls import CONTROLS
 from dsfit.experiment.files import number
 from dsfit.experiment.plots.style import COLORS, new_figure
 from dsfit.experiment.rundir import RunDirectory
 
+_RATIOS = (0.2, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0)
 _DECADES = 16.0  # beyond it a rejection is as clear as it needs to be
 
 
@@ -41,13 +42,13 @@ def figures(directory: RunDirectory, result: dict[str, Any]) -> Iterator[tuple[s
     clear.set_xlabel("decades of p, or of deviation over bound (bar: needed)")
     clear.set_title("how clearly the printed form is rejected")
     effect.set_xscale("log")
-    effect.xaxis.set_major_formatter(ScalarFormatter())
-    effect.xaxis.set_minor_formatter(ScalarFormatter())
+    effect.set_xticks(_RATIOS, [f"{ratio:g}" for ratio in _RATIOS], minor=False)
+    effect.xaxis.set_minor_locator(NullLocator())
     effect.axvline(1, color="#555555", linewidth=1)
     effect.set_xlabel("integral as printed over the right one")
     effect.set_title("effect on the light of the scene")
     for axis in (clear, effect):
-        axis.grid(True, axis="x", which="both")
+        axis.grid(True, axis="x", color="#dddddd")
         axis.xaxis.label.set_size(8)
     yield "controls", figure
 
