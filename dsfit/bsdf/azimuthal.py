@@ -11,7 +11,7 @@ from torch import Tensor
 from dsfit.bsdf.attenuation import Absorption, attenuation, lobe_energies
 from dsfit.bsdf.fiber import Fiber
 from dsfit.bsdf.glint import Glint
-from dsfit.bsdf.scattered import offset_windows, simplified_windows
+from dsfit.bsdf.scattered import beyond_pi, offset_windows, simplified_windows
 from dsfit.bsdf.snell import Caustic, Rays, Refraction, rays_trt, rays_tt
 from dsfit.frame import HALF_PI, wrap
 from dsfit.special import wrapped_normal_log_prob
@@ -50,7 +50,7 @@ def azimuthal(
 def simplified_shapes(fiber: Fiber, phi: Tensor) -> Tensor:
     """Unit-integral azimuths cos(phi/2)/4, wrapped g(phi - pi; gamma_TT), cos(phi/2)/4, `[..., 3]`."""
     cosine = torch.cos(phi / 2).abs() / 4  # pi of float32 lies beyond pi
-    transmitted = torch.exp(wrapped_normal_log_prob(wrap(phi - math.pi), fiber.gamma_tt))
+    transmitted = torch.exp(wrapped_normal_log_prob(beyond_pi(phi), fiber.gamma_tt))
     return torch.stack(torch.broadcast_tensors(cosine, transmitted, cosine), dim=-1)
 
 

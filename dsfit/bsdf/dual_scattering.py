@@ -222,9 +222,7 @@ class DualScattering:
         return parts[0], parts[1]
 
     def transmittance(self, theta_in: Tensor, n: Tensor) -> Tensor:
-        """T_f(n, theta_in) = d_f a_f(theta_in)^n (eq 32), `[..., C]`; a power in logs, right for n = 0 and for huge
-        n.
-        """
+        """T_f(n, theta_in) = d_f a_f(theta_in)^n (eq 32), `[..., C]`; right for n = 0 and for huge n."""
         n = torch.as_tensor(n, dtype=theta_in.dtype, device=theta_in.device)
         return self._transmittance(self.averages(theta_in), n)
 
@@ -257,8 +255,8 @@ class DualScattering:
         return (factor / cos_inclination(diff) ** 2).unsqueeze(-1)
 
     def _transmittance(self, average: Averages, n: Tensor) -> Tensor:
-        log_a = torch.log(average.a_f.clamp_min(torch.finfo(average.a_f.dtype).tiny))
-        return self.d_f.to(n.dtype) * torch.exp(n.unsqueeze(-1) * log_a)
+        base = average.a_f.clamp_min(torch.finfo(average.a_f.dtype).tiny)  # 0^n has no derivative in n
+        return self.d_f.to(n.dtype) * torch.pow(base, n.unsqueeze(-1))
 
     def _variance_f(self, average: Averages, n: Any, like: Tensor) -> Tensor:
         """sigma_f^2 = n beta_f^2, `[..., C]`."""

@@ -11,10 +11,12 @@ from dsfit.bsdf.attenuation import Absorption, integrate_offsets
 from dsfit.bsdf.fiber import Fiber
 from dsfit.bsdf.glint import Glint
 from dsfit.bsdf.snell import Caustic, Refraction, exit_trt, gamma_tt, root_falling, root_rising
-from dsfit.frame import HALF_PI, wrap
+from dsfit.frame import HALF_PI
 from dsfit.special import normal_mass
 
 _SERIES = 4
+_NARROW = 0.1  # radians of caustic_width below which intervals are cut at the flanks of what the glint removes
+_FLANK = 8.0  # standard deviations from a glint to where nothing is removed any more
 
 
 def offset_windows(
@@ -27,7 +29,7 @@ def offset_windows(
     pi/2: [0, pi/2 - phi] + [0, pi/2 + phi];  phi > pi/2: [phi - pi/2, pi] + [3 pi/2 - phi, pi].
     """
     near = phi <= HALF_PI
-    first = (phi - HALF_PI).abs()
+    first = torch.where(near, HALF_PI - phi, phi - HALF_PI)  # not abs, whose derivative is 0 at pi/2
     second = torch.where(near, phi + HALF_PI, 3 * HALF_PI - phi)
     psi = torch.stack([first, second], dim=-1)
     wide = tuple(b.map(lambda x: x.unsqueeze(-1)) for b in bent)
@@ -43,9 +45,11 @@ def offset_windows(
 
 
 def _node_count(fiber: Fiber, model: str) -> int:
-    """Gauss nodes per interval: the glint's removal factor is the narrowest feature, about sqrt(w_c) wide in gamma."""
+    """Gauss nodes per interval: the glint's removal factor is the narrowest feature, about sqrt(w_c) wide in gamma;
+    where it is narrower than `_NARROW`, intervals are cut at its flanks instead.
+    """
     narrow = float(fiber.caustic_width.detach().min()) if model == "marschner" else 1.0
-    return int(min(96, max(32, math.ceil(14 / math.sqrt(narrow)))))
+    return 40 if narrow < _NARROW else max(32, math.ceil(14 / math.sqrt(narrow)))
 
 
 def _mass_r(
@@ -98,13 +102,34 @@ def _mass_trt(
     weight = None if glint is None else _removal(glint, kappa)
     sigma_a = fiber.sigma_a.unsqueeze(-2)
     zero, middle = torch.zeros_like(a), caustic.gamma
+    rising, falling = _removal_cuts(glint, kappa, caustic)
     # inner: [0, a] and [b, c];  outer: [a, b] and [c, pi/2], the first split at the fold
     total: Tensor | float = 0.0
-    for low_in, high_in, low_out, high_out in ((zero, a, a, middle), (b, b, middle, b), (b, c, c, zero + HALF_PI)):
+    for cuts, low_in, high_in, low_out, high_out in (
+        (rising, zero, a, a, middle),
+        (falling[:1], b, b, middle, b),
+        (falling, b, c, c, zero + HALF_PI),
+    ):
         low, high = torch.where(inner, low_in, low_out), torch.where(inner, high_in, high_out)
-        total = total + integrate_offsets(2, wide, sigma_a, low, high, absorption, weight, nodes)
+        ends = [low, *(torch.minimum(torch.maximum(cut, low), high) for cut in cuts), high]
+        for start, end in zip(ends[:-1], ends[1:], strict=True):
+            total = total + integrate_offsets(2, wide, sigma_a, start, end, absorption, weight, nodes)
     mass = total.sum(-2)
     return mass if glint is None else mass + glint.added_mass(phi)
+
+
+def _removal_cuts(glint: Glint | None, kappa: Tensor, caustic: Caustic) -> tuple[list[Tensor], list[Tensor]]:
+    """Offsets on the rising and on the falling branch where the removal of a narrow glint sets in or ends, increasing;
+    none if it is not narrow. Where exactly makes no difference to the sum, so they carry no derivatives.
+    """
+    if glint is None or float(glint.width.detach().min()) >= _NARROW:
+        return [], []
+    width = glint.width.detach()
+    reach = _FLANK * (width.unsqueeze(-1) if width.ndim else width)
+    kappa, fold = kappa.detach(), caustic.detach()
+    rising = torch.where(fold.folded, root_rising(kappa, fold, fold.phi - reach), 0.0)
+    falling = [root_falling(kappa, fold, phi) for phi in (fold.phi - reach, reach - fold.phi, -fold.phi - reach)]
+    return [rising], list(torch.sort(torch.stack(falling), dim=0).values)
 
 
 def _removal(glint: Glint, kappa: Tensor):  # noqa: ANN202
@@ -126,9 +151,15 @@ def simplified_windows(fiber: Fiber, phi: Tensor) -> Tensor:
     """
     root2 = math.sqrt(0.5)
     cosine = torch.where(phi <= HALF_PI, root2 * torch.cos(phi / 2), 1 - root2 * torch.sin(phi / 2))
-    distance = wrap(phi - math.pi)
-    transmitted = wrapped_window(distance, fiber.gamma_tt)
+    transmitted = wrapped_window(beyond_pi(phi), fiber.gamma_tt)
     return torch.stack(torch.broadcast_tensors(cosine, transmitted, cosine), dim=-1)
+
+
+def beyond_pi(phi: Tensor) -> Tensor:
+    """phi - pi for phi in [0, pi], to the last digit: pi in two parts, the first of them exact in the dtype."""
+    rounded = float(torch.tensor(math.pi, dtype=phi.dtype))
+    rest = (math.pi - rounded) + 1.2246467991473532e-16  # pi - float64(pi)
+    return (phi - rounded) - rest
 
 
 def wrapped_window(distance: Tensor, width: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ def test_fresnel_of_float32_follows_float64(eta: float) -> None:
             value = fresnel(*leaves)[which]
             found.append([value.detach(), *torch.autograd.grad(value.sum(), leaves)])
         for single, double in zip(*found, strict=True):
-            torch.testing.assert_close(single.double(), double, rtol=2e-5, atol=1e-12 if eta < 1.1 else 1e-9)
+            torch.testing.assert_close(single.double(), double, rtol=2e-5 if eta < 1.1 else 5e-4, atol=1e-12)
 
 
 def test_fresnel_shares_add_up() -> None:
