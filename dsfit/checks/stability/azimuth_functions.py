@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dsfit.checks.stability import twins
 from dsfit.checks.stability.function import Function, Point
+from dsfit.checks.stability.limits import FEW_ULPS, within
 from dsfit.checks.stability.points import product
 from dsfit.proposals.azimuth import CosineHalfLaw, TruncatedGaussianLaw, WrappedGaussianLaw
 from dsfit.proposals.uniform import UniformArcLaw
@@ -134,6 +135,7 @@ FUNCTIONS: list[Function] = [
         _on_circle(lambda phi: mp.log(mp.cos(phi / 2) / 4)),
         _COSINE,
         logarithm=True,
+        limits=FEW_ULPS,
     ),
     Function(
         "cosine_azimuth.sample",
@@ -143,6 +145,7 @@ FUNCTIONS: list[Function] = [
         {"ordinary": [(u,) for u in MIDDLES], "ends of u": [(u,) for u in (1e-300, *ENDS)]},
         naive=lambda u: 2 * torch.asin(2 * u - 1),
         scale=_one,
+        limits=FEW_ULPS,
     ),
     Function(
         "cosine_azimuth.scattered",
@@ -151,6 +154,7 @@ FUNCTIONS: list[Function] = [
         _on_circle(lambda phi: mp.log(_cosine_window(phi))),
         _TURNED,
         logarithm=True,
+        limits=FEW_ULPS,
     ),
     Function(
         "wrapped_azimuth.log_prob",
@@ -160,6 +164,7 @@ FUNCTIONS: list[Function] = [
         DENSITIES,
         naive=lambda phi, std: _naive_images(math.pi - phi, std),
         logarithm=True,
+        limits=FEW_ULPS,
     ),
     Function(
         "wrapped_azimuth.sample",
@@ -169,6 +174,11 @@ FUNCTIONS: list[Function] = [
         _SAMPLES | {"ends of u: 1e-300": [(1e-300, 1e-3), (1e-300, 0.05)]},
         naive=_naive_drawn,
         scale=_one,
+        limits=FEW_ULPS,
+        loose={
+            "wide": within(4e-14, 1e-14, 3e-5, 1e-5),
+            "ends of u": within(2e-15, 6e-13, 2e-6, 5e-5),
+        },
     ),
     Function(
         "wrapped_azimuth.scattered",
@@ -178,6 +188,14 @@ FUNCTIONS: list[Function] = [
         WINDOWS,
         naive=_naive_window,
         logarithm=True,
+        limits=FEW_ULPS,
+        loose={
+            "ordinary": within(4e-15, 4e-14, 2e-6, 2e-5),
+            "tail": within(3e-15, 2e-13, 2e-6, 1e-5),
+            "caustic": within(2e-15, 3e-11, 2e-6, 7e-3),
+            "narrow": within(5e-12, 4e-11, 2e-3, 2e-2),
+            "switch": within(8e-15, 2e-9, 5e-6, 5e-4),
+        },
     ),
     Function(
         "truncated_azimuth.log_prob",
@@ -188,6 +206,10 @@ FUNCTIONS: list[Function] = [
         | {"caustic: the seam at pi": product([3.1415, -3.14159, -BEFORE_PI], [0.3, 1.0])},
         naive=_naive_truncated,
         logarithm=True,
+        limits=FEW_ULPS,
+        loose={
+            "wide": within(2e-15, 3e-11, 2e-6, 4e-3),
+        },
     ),
     Function(
         "truncated_azimuth.sample",
@@ -196,6 +218,11 @@ FUNCTIONS: list[Function] = [
         _open(lambda u, std: _wrap(mp.pi - twins.truncated_quantile(u, mp.mpf(0), std, -mp.pi, mp.pi))),
         _SAMPLES,
         scale=_one,
+        limits=FEW_ULPS,
+        loose={
+            "wide": within(2e-14, 2e-11, 8e-6, 6e-3),
+            "ends of u": within(5e-15, 2e-13, 2e-6, 6e-5),
+        },
     ),
     Function(
         "truncated_azimuth.scattered",
@@ -204,6 +231,12 @@ FUNCTIONS: list[Function] = [
         _on_circle(lambda phi, std: mp.log(twins.truncated_window(_distance(phi), std))),
         {name: rows for name, rows in WINDOWS.items() if "seam" not in name},
         logarithm=True,
+        limits=FEW_ULPS,
+        loose={
+            "wide": within(7e-15, 1e-11, 2e-6, 3e-3),
+            "narrow": within(5e-12, 4e-11, 2e-3, 2e-2),
+            "switch": within(8e-15, 2e-9, 5e-6, 7e-4),
+        },
     ),
     Function(
         "front_half.scattered",
@@ -212,5 +245,6 @@ FUNCTIONS: list[Function] = [
         _on_circle(lambda phi: mp.log(abs(phi) / mp.pi**2)),
         {"ordinary": [(x,) for x in (-2.0, 0.4, 1.3, 3.0)], "tail: to 0": [(1e-3,), (-1e-10,), (1e-30,)]},
         logarithm=True,
+        limits=FEW_ULPS,
     ),
 ]

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dsfit.checks.stability.function import Function, Point
+from dsfit.checks.stability.limits import FEW_ULPS, within
 from dsfit.checks.stability.points import deg, product
 from dsfit.context import Context
 from dsfit.frame import cos_inclination, to_angles, to_vector, wrap
@@ -119,8 +120,10 @@ FUNCTIONS: list[Function] = [
         },
         naive=lambda x: torch.atan2(torch.sin(x), torch.cos(x)),
         scale=lambda x, value: 1.0,
-        # The turns are counted in a 2 pi of the dtype: x / 2 pi of its rounding errors.
-        loose={"wide": {"float64": (1e-11, 1e-15), "float32": (2e-2, 1e-6)}},
+        limits=FEW_ULPS,
+        loose={
+            "wide": within(5e-12, 1e-14, 7e-3, 1e-5),
+        },
     ),
     Function(
         "frame.cos_inclination",
@@ -132,6 +135,7 @@ FUNCTIONS: list[Function] = [
             "grazing: theta to 90 deg": [(x,) for x in (*deg(89.9, -89.999, 89.99999), HALF_PI)],
         },
         density=True,
+        limits=FEW_ULPS,
     ),
     Function(
         "frame.theta_there_and_back",
@@ -141,6 +145,7 @@ FUNCTIONS: list[Function] = [
         _DIRECTIONS,
         naive=_naive_theta,
         gradient_scale=_whole,
+        limits=FEW_ULPS,
     ),
     Function(
         "frame.phi_there_and_back",
@@ -150,8 +155,10 @@ FUNCTIONS: list[Function] = [
         _DIRECTIONS,
         naive=_naive_phi,
         gradient_scale=_whole,
-        # What rounding of the vector does to phi grows like 1 / cos(theta), and its derivative with it.
-        loose={"grazing": {"float64": (1e-14, 10.0), "float32": (1e-6, 10.0)}},
+        limits=FEW_ULPS,
+        loose={
+            "grazing": within(2e-15, 5.0, 2e-6, 1.0),
+        },
     ),
     Function(
         "light.log_normaliser",
@@ -166,6 +173,10 @@ FUNCTIONS: list[Function] = [
         },
         naive=_naive_normaliser,
         logarithm=True,
+        limits=FEW_ULPS,
+        loose={
+            "switch": within(2e-15, 1e-14, 2e-6, 3e-5),
+        },
     ),
     Function(
         "light.log_density",
@@ -180,6 +191,11 @@ FUNCTIONS: list[Function] = [
         },
         naive=_naive_lobe,
         logarithm=True,
+        limits=FEW_ULPS,
+        loose={
+            "ordinary": within(2e-15, 1e-14, 2e-6, 6e-5),
+            "narrow": within(5e-14, 2e-10, 2e-5, 4e-1),
+        },
     ),
     Function(
         "light.sample",
@@ -194,5 +210,6 @@ FUNCTIONS: list[Function] = [
         },
         naive=_naive_angle,
         gradients=(),
+        limits=FEW_ULPS,
     ),
 ]

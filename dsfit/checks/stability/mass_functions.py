@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from dsfit.checks.stability.function import Function, Point
-from dsfit.checks.stability.longitudinal_functions import lobe_laws
+from dsfit.checks.stability.limits import FEW_ULPS, within
+from dsfit.checks.stability.lobe_points import lobe_laws
 from dsfit.checks.stability.points import deg
 from dsfit.proposals.azimuth import CosineHalfLaw, TruncatedGaussianLaw, WrappedGaussianLaw
 from dsfit.proposals.cauchy_lobe import CauchyInclination
@@ -117,6 +118,12 @@ FUNCTIONS: list[Function] = [
         _one,
         lobe_laws(),
         gradient_scale=_per_width,
+        limits=FEW_ULPS,
+        loose={
+            "narrow": within(1e-11, 7e-12, 7e-4, 3e-3),
+            "grazing": within(9e-14, 3e-13, 9e-5, 2e-4),
+            "tail": within(2e-12, 2e-12, 5e-3, 9e-3),
+        },
     ),
     Function(
         "mass.cauchy_lobe",
@@ -125,6 +132,10 @@ FUNCTIONS: list[Function] = [
         _one,
         lobe_laws(),
         gradient_scale=_per_width,
+        limits=FEW_ULPS,
+        loose={
+            "narrow": within(9e-12, 7e-12, 7e-4, 2e-3),
+        },
     ),
     Function(
         "mass.split_lobe",
@@ -133,6 +144,12 @@ FUNCTIONS: list[Function] = [
         _one,
         lobe_laws(),
         gradient_scale=_per_width,
+        limits=FEW_ULPS,
+        loose={
+            "narrow": within(2e-11, 2e-11, 2e-3, 4e-3),
+            "grazing": within(4e-13, 2e-12, 3e-4, 2e-3),
+            "tail": within(2e-12, 5e-12, 5e-3, 2e-2),
+        },
     ),
     Function(
         "mass.transmittance_cosine",
@@ -143,6 +160,7 @@ FUNCTIONS: list[Function] = [
             "ordinary": [(x,) for x in deg(-60.0, 0.7, 35.0)],
             "grazing": [(x,) for x in (*deg(89.9, -89.999), HALF_PI, -HALF_PI)],
         },
+        limits=FEW_ULPS,
     ),
     Function(
         "mass.uniform_inclination",
@@ -151,6 +169,7 @@ FUNCTIONS: list[Function] = [
         _one,
         _PLACES,
         gradients=(),
+        limits=FEW_ULPS,
     ),
     Function(
         "mass.cosine_azimuth",
@@ -159,6 +178,7 @@ FUNCTIONS: list[Function] = [
         _one,
         _PLACES,
         gradients=(),
+        limits=FEW_ULPS,
     ),
     Function(
         "mass.cosine_azimuth_scattered",
@@ -167,9 +187,49 @@ FUNCTIONS: list[Function] = [
         _one,
         _PLACES,
         gradients=(),
+        limits=FEW_ULPS,
     ),
-    Function("mass.wrapped_azimuth", ("gamma",), _circle(WrappedGaussianLaw), _one, _WIDTHS),
-    Function("mass.wrapped_azimuth_scattered", ("gamma",), _circle(WrappedGaussianLaw, True), _one, _WIDTHS),
-    Function("mass.truncated_azimuth", ("gamma",), _circle(TruncatedGaussianLaw), _one, _WIDTHS),
-    Function("mass.truncated_azimuth_scattered", ("gamma",), _circle(TruncatedGaussianLaw, True), _one, _WIDTHS),
+    Function(
+        "mass.wrapped_azimuth",
+        ("gamma",),
+        _circle(WrappedGaussianLaw),
+        _one,
+        _WIDTHS,
+        limits=FEW_ULPS,
+        loose={
+            "narrow": within(4e-12, 4e-11, 5e-4, 3e-2),
+            "switch": within(3e-14, 3e-14, 2e-6, 1e-5),
+        },
+    ),
+    Function(
+        "mass.wrapped_azimuth_scattered",
+        ("gamma",),
+        _circle(WrappedGaussianLaw, True),
+        _one,
+        _WIDTHS,
+        limits=FEW_ULPS,
+    ),
+    Function(
+        "mass.truncated_azimuth",
+        ("gamma",),
+        _circle(TruncatedGaussianLaw),
+        _one,
+        _WIDTHS,
+        limits=FEW_ULPS,
+        loose={
+            "narrow": within(4e-12, 4e-11, 5e-4, 3e-2),
+            "switch": within(3e-14, 3e-14, 2e-6, 1e-5),
+        },
+    ),
+    Function(
+        "mass.truncated_azimuth_scattered",
+        ("gamma",),
+        _circle(TruncatedGaussianLaw, True),
+        _one,
+        _WIDTHS,
+        limits=FEW_ULPS,
+        loose={
+            "wide": within(9e-15, 1e-14, 2e-6, 1e-5),
+        },
+    ),
 ]

@@ -11,6 +11,7 @@ from torch import Tensor
 from dsfit import special
 from dsfit.checks.stability import twins
 from dsfit.checks.stability.function import Function, Point
+from dsfit.checks.stability.limits import FEW_ULPS, within
 from dsfit.checks.stability.points import product, thin
 
 INF = math.inf
@@ -172,6 +173,10 @@ FUNCTIONS: list[Function] = [
         },
         naive=_naive_mills,
         logarithm=True,
+        limits=FEW_ULPS,
+        loose={
+            "switch": within(3e-15, 2e-13, 2e-6, 4e-5),
+        },
     ),
     Function(
         "special.log_window",
@@ -181,6 +186,10 @@ FUNCTIONS: list[Function] = [
         _windows(),
         naive=_naive_log_window,
         logarithm=True,
+        limits=FEW_ULPS,
+        loose={
+            "switch": within(3e-14, 3e-13, 6e-6, 2e-5),
+        },
     ),
     Function(
         "special.log_normal_mass",
@@ -190,6 +199,10 @@ FUNCTIONS: list[Function] = [
         _windows(),
         naive=_naive_log_mass,
         logarithm=True,
+        limits=FEW_ULPS,
+        loose={
+            "switch": within(2e-14, 3e-13, 5e-6, 2e-5),
+        },
     ),
     Function(
         "special.normal_mass",
@@ -199,6 +212,13 @@ FUNCTIONS: list[Function] = [
         {name: rows for name, rows in _windows().items() if "small" not in name},
         naive=_naive_mass,
         density=True,
+        limits=FEW_ULPS,
+        loose={
+            "ordinary": within(7e-15, 1e-14, 3e-6, 1e-5),
+            "wide": within(6e-15, 1e-14, 2e-6, 1e-5),
+            "tail": within(5e-13, 6e-13, 6e-6, 1e-5),
+            "switch": within(6e-14, 4e-14, 2e-5, 2e-5),
+        },
     ),
     Function(
         "special.log_gauss",
@@ -213,6 +233,7 @@ FUNCTIONS: list[Function] = [
         },
         naive=_naive_gauss,
         logarithm=True,
+        limits=FEW_ULPS,
     ),
     Function(
         "special.truncated_normal_log_prob",
@@ -222,6 +243,11 @@ FUNCTIONS: list[Function] = [
         {name: _at(thin(rows, 12)) for name, rows in _truncated_points().items()},
         naive=_naive_truncated,
         logarithm=True,
+        limits=FEW_ULPS,
+        loose={
+            "narrow": within(6e-15, 1e-14, 8e-6, 1e-5),
+            "wide": within(6e-15, 4e-12, 3e-6, 3e-3),
+        },
     ),
     Function(
         "special.truncated_normal_icdf",
@@ -231,6 +257,14 @@ FUNCTIONS: list[Function] = [
         {name: thin(rows, 12) for name, rows in _quantile_points().items()},
         naive=_naive_quantile,
         scale=lambda u, mean, std, low, high, x: 0.1,
+        limits=FEW_ULPS,
+        loose={
+            "ordinary": within(4e-15, 1e-13, 2e-6, 4e-5),
+            "wide": within(3e-14, 4e-12, 3e-5, 6e-3),
+            "tail": within(2e-15, 6e-11, 2e-6, 2e-2),
+            "small": within(2e-15, 5e-12, 2e-6, 4e-3),
+            "ends of u": within(4e-15, 4e-12, 2e-6, 3e-4),
+        },
     ),
     Function(
         "special.wrapped_normal_log_prob",
@@ -240,5 +274,9 @@ FUNCTIONS: list[Function] = [
         WRAPPED,
         naive=_naive_wrapped,
         logarithm=True,
+        limits=FEW_ULPS,
+        loose={
+            "caustic": within(2e-15, 2e-10, 2e-6, 2e-1),
+        },
     ),
 ]

@@ -11,6 +11,7 @@ from torch import Tensor
 from dsfit.bsdf.dual_scattering import DualScattering
 from dsfit.bsdf.fiber import Fiber
 from dsfit.checks.stability.function import Function, Point
+from dsfit.checks.stability.limits import FEW_ULPS, within
 from dsfit.checks.stability.points import product
 from dsfit.mis.heuristics import Balance, Heuristic, Power
 from dsfit.proposals.mixture import log_sum_exp
@@ -77,6 +78,10 @@ FUNCTIONS: list[Function] = [
         naive=lambda log_p, log_q: _naive_weight(1, log_p, log_q),
         gradient_scale=_vanishing,
         density=True,
+        limits=FEW_ULPS,
+        loose={
+            "small": within(2e-14, 1e-14, 3e-6, 1e-5),
+        },
     ),
     Function(
         "mis.power",
@@ -87,6 +92,10 @@ FUNCTIONS: list[Function] = [
         naive=lambda log_p, log_q: _naive_weight(2, log_p, log_q),
         gradient_scale=_vanishing,
         density=True,
+        limits=FEW_ULPS,
+        loose={
+            "small": within(3e-14, 1e-14, 5e-6, 1e-5),
+        },
     ),
     Function(
         "mixture.log_density",
@@ -96,6 +105,11 @@ FUNCTIONS: list[Function] = [
         _PAIRS,
         naive=lambda log_p, log_q: torch.log(0.9 * torch.exp(log_p) + 0.1 * torch.exp(log_q)),
         logarithm=True,
+        limits=FEW_ULPS,
+        loose={
+            "narrow": within(2e-15, 3e-12, 2e-6, 3e-2),
+            "tail": within(2e-15, 9e-11, 2e-6, 3e-2),
+        },
     ),
     Function(
         "bsdf.passed",
@@ -111,5 +125,11 @@ FUNCTIONS: list[Function] = [
         },
         naive=lambda a_f, n: a_f**n,
         density=True,
+        limits=FEW_ULPS,
+        loose={
+            "ordinary": within(7e-15, 1e-14, 3e-6, 1e-5),
+            "dark": within(4e-14, 4e-14, 8e-6, 1e-5),
+            "deep n": within(2e-13, 2e-13, 3e-6, 1e-5),
+        },
     ),
 ]
