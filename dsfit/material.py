@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from dsfit.arguments import check_uniforms
 from dsfit.bsdf.dual_scattering import DualScattering
 from dsfit.context import Context
-from dsfit.errors import InputError
+from dsfit.errors import FLOATS, InputError
 from dsfit.frame import to_angles, to_vector
 from dsfit.proposals.base import Proposal
 from dsfit.scene.integrand import Integrand
@@ -75,8 +76,7 @@ class Material:
         """Draw wi from uniforms `[*samples, *batch, k]` in (0, 1), k = `proposal(context).dimension`."""
         context = self.context(wo)
         distribution = self.proposal(context)
-        if u.shape[-1] < distribution.dimension:
-            raise InputError("u", tuple(u.shape), f"a last dimension of at least {distribution.dimension}")
+        check_uniforms(u, distribution.dimension, context.batch_shape)
         omega, log_prob = distribution.sample_with_log_prob(u)
         wi = to_vector(omega)
         value = self._integrand(omega, context) / _cos_normal(wi).unsqueeze(-1)
@@ -88,6 +88,8 @@ def _cos_normal(wi: Tensor) -> Tensor:
 
 
 def _unit(field: str, vector: Tensor) -> Tensor:
+    if not isinstance(vector, Tensor) or vector.dtype not in FLOATS:
+        raise InputError(field, getattr(vector, "dtype", vector), "a float64 or float32 tensor")
     if vector.ndim == 0 or vector.shape[-1] != 3:
         raise InputError(field, tuple(vector.shape), "unit vectors with a last dimension of 3")
     length = torch.linalg.vector_norm(vector.detach(), dim=-1)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dsfit.context import Context
 from dsfit.cubature import Cubature, integrate, nodes_of
-from dsfit.errors import InputError
+from dsfit.errors import InputError, as_number
 from dsfit.frame import cos_inclination, wrap
 from dsfit.proposals.base import Distribution, Proposal
 from dsfit.scene.integrand import Integrand
@@ -121,9 +121,9 @@ def reference(
     suffice; the error bound then says what was reached. Float64 throughout.
 
     Raises:
-        InputError: `rtol` is not in (0, 1).
+        InputError: `rtol` is not in (0, 1), no context, or an integrand that is none.
     """
-    _check_rtol(rtol)
+    _check(integrand, context, rtol, max_evaluations)
     context = context.to(torch.float64)
     results = []
     for one in _each(context):
@@ -164,7 +164,7 @@ def quadrature_nodes(
         context: a single context (batch shape `()`).
         even: keep only phi >= 0, with doubled weights. Only for integrands and densities even in azimuth.
     """
-    _check_rtol(rtol)
+    _check(integrand, context, rtol)
     context = context.to(torch.float64)
     if context.batch_shape != ():
         raise InputError("context", tuple(context.batch_shape), "a single context, of batch shape ()")
@@ -204,7 +204,9 @@ def excess(
 
     `rtol` is relative to the excess (with an absolute floor of 1e-7).
     """
-    _check_rtol(rtol)
+    _check(integrand, context, rtol, max_evaluations)
+    if not callable(proposal):
+        raise InputError("proposal", type(proposal).__name__, "a proposal")
     context = context.to(torch.float64)
     rows = [_excess_one(integrand, proposal, one, rtol, max_evaluations) for one in _each(context)]
     shape = context.batch_shape
@@ -239,6 +241,12 @@ def _each(context: Context) -> list[Context]:
     return [flat[i] for i in range(len(flat))]
 
 
-def _check_rtol(rtol: float) -> None:
-    if not 0 < rtol < 1:
-        raise InputError("rtol", rtol, "a number in (0, 1)")
+def _check(integrand: Integrand, context: Context, rtol: float, max_evaluations: int = 1) -> None:
+    for name in ("theta_breaks", "azimuth_edges", "is_even"):
+        if not hasattr(integrand, name):
+            raise InputError("integrand", type(integrand).__name__, f"an Integrand (this has no {name})")
+    if not isinstance(context, Context) or not context.batch_shape.numel():
+        raise InputError("context", context, "a Context with at least one element")
+    as_number("rtol", rtol, 0.0, 1.0, open_low=True, open_high=True)
+    if isinstance(max_evaluations, bool) or not isinstance(max_evaluations, int) or max_evaluations < 1:
+        raise InputError("max_evaluations", max_evaluations, "an integer >= 1")

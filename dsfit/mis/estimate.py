@@ -126,7 +126,10 @@ def estimate(
     rule = as_heuristic(heuristic)
     check_choice("model", model, MODELS)
     check_choice("uniforms", uniforms, KINDS)
-    proposals = [proposals] if isinstance(proposals, nn.Module) or callable(proposals) else list(proposals)
+    single = isinstance(proposals, nn.Module) or callable(proposals)
+    if not single and (not isinstance(proposals, Sequence | nn.ModuleList) or not all(map(callable, proposals))):
+        raise InputError("proposals", proposals, "a proposal or a list of at least one")
+    proposals = [proposals] if single else list(proposals)
     if not proposals:
         raise InputError("proposals", proposals, "a proposal or a list of at least one")
     if not isinstance(generator, torch.Generator):

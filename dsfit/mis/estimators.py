@@ -143,7 +143,12 @@ def multi_sample(
     is needed by the optimal heuristic and must not come from the same uniforms.
     """
     rule = _rule(heuristic, alpha)
+    if len(uniforms) != len(distributions) or not all(isinstance(u, Tensor) and u.ndim for u in uniforms):
+        shapes = [tuple(getattr(u, "shape", ())) for u in uniforms]
+        raise InputError("uniforms", shapes, f"shapes [n, *batch, dimension], one for each of {len(distributions)}")
     total = sum(u.shape[0] for u in uniforms)
+    if not total:
+        raise InputError("uniforms", total, "at least one sample")
     fractions = torch.tensor([u.shape[0] / total for u in uniforms], dtype=context.dtype, device=context.device)
     result: Tensor | None = None
     for s, u in enumerate(uniforms):
