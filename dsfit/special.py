@@ -208,7 +208,8 @@ def truncated_normal_icdf(u: Tensor, mean: Tensor, std: Tensor, low: Tensor, hig
 
         phi(z) dz = (1 - u) phi(a) da + u phi(b) db + (Phi(b) - Phi(a)) du,   x = mean + std z.
 
-    First derivatives only: second derivatives of this function come out as zero. u is clamped into the open interval.
+    First derivatives only: second derivatives of this function come out as zero, and those of what is made of it are
+    wrong. u is clamped into the open interval.
     """
     a, b, width = (low - mean) / std, (high - mean) / std, (high - low) / std
     with torch.no_grad():

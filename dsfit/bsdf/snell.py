@@ -156,7 +156,7 @@ def root_rising(kappa: Tensor, caustic: Caustic, phi: Tensor) -> Tensor:
 
 def _attach(kappa: Tensor, gamma: Tensor, phi: Tensor) -> Tensor:
     """Give a converged root its derivatives by the implicit function theorem: one Newton step with the slope held
-    fixed.
+    fixed. First derivatives only: second derivatives of what is made of it are not to be used.
     """
     slope = exit_trt_slope(kappa, gamma).detach()
     limit = torch.finfo(kappa.dtype).eps ** 0.5

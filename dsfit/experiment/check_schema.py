@@ -60,7 +60,16 @@ class FurnaceOptions(Section):
 
 
 class GradientsOptions(Section):
-    """`[check.gradients]`."""
+    """`[check.gradients]`: points that derivatives are taken at, samples of every Monte Carlo gradient of the second
+    moment, the uniform sphere's share in proposals without one, whose second moments are differentiated (those that are
+    not the chapter's always are), and whether to differentiate through a fit and, in minutes, the averages."""
+
+    points: Annotated[int, Field(ge=8, le=1000)] = 24
+    samples: Annotated[int, Field(ge=1000, le=10**7)] = 20_000
+    defensive: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    moments: Names = ["R", "TT", "mixture", "structured"]
+    through_fit: bool = True
+    averages: bool = False
 
 
 class StabilityOptions(Section):

@@ -19,7 +19,8 @@ CLEAR = 1e-3
 """Differences say something where their own error is below this share of |derivative| + |f| per unit."""
 MODES_AGREE = 1e-8
 """Largest difference of the two modes relative to |derivative| + |f|: they round differently, and in nothing else."""
-_ROUNDING = 1e-12  # of automatic differentiation itself, relative to |derivative| + |f|
+ROUNDING = 1e-12
+"""Of automatic differentiation itself, relative to |derivative| + |f|."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class DerivativeCheck:
         name: of the input.
         numeric, error: extrapolated differences and the estimate of their error.
         reverse, forward: by automatic differentiation; `forward` None where forward mode raised (`refused` says what).
-        tolerance: `SAFETY error + 1e-12 (|numeric| + |f|)`.
+        tolerance: `SAFETY error + floor (|numeric| + |f|)`.
         clear: where the differences are good enough to judge by; elsewhere is a kink, a jump, or something narrower
             than the smallest step.
     """
@@ -87,6 +88,8 @@ def check_derivative(
     step: float | Tensor = 0.1,
     levels: int = LEVELS,
     at_once: bool = False,
+    forward: bool = True,
+    floor: float = ROUNDING,
 ) -> DerivativeCheck:
     """Compare the derivatives of `function` in its input `name`.
 
@@ -101,10 +104,13 @@ def check_derivative(
         levels: number of steps.
         at_once: `function` also takes the input with one more dimension in front, which its result then has as well;
             the differences are then one call.
+        forward: whether forward mode is tried as well.
+        floor: what the function itself is smooth to, relative to |derivative| + |f|.
     """
     values = {key: value.detach() for key, value in values.items()}
     if own:
-        return _check_own(function, values, name, torch.as_tensor(step).expand(values[name].shape), levels, at_once)
+        steps = torch.as_tensor(step).expand(values[name].shape)
+        return _check_own(function, values, name, steps, levels, at_once, floor)
     point = values[name]
     numeric, error, scale = [], [], []
     units = torch.eye(point.numel(), dtype=point.dtype).reshape(-1, *point.shape)
@@ -119,21 +125,28 @@ def check_derivative(
         error.append(found.error)
         scale.append(found.scale)
     reverse = _reverse(function, values, name)
-    forward, refused = _forward(function, values, name, units)
-    return _compared(name, torch.stack(numeric), torch.stack(error), torch.stack(scale), reverse, forward, refused)
+    ahead, refused = _forward(function, values, name, units) if forward else (None, "")
+    return _compared(name, torch.stack(numeric), torch.stack(error), torch.stack(scale), reverse, ahead, refused, floor)
 
 
 def _compared(
-    name: str, numeric: Tensor, error: Tensor, size: Tensor, reverse: Tensor, forward: Tensor | None, refused: str
+    name: str,
+    numeric: Tensor,
+    error: Tensor,
+    size: Tensor,
+    reverse: Tensor,
+    forward: Tensor | None,
+    refused: str,
+    floor: float,
 ) -> DerivativeCheck:
     scale = numeric.abs().nan_to_num(nan=0.0) + size
-    tolerance = SAFETY * error + _ROUNDING * scale + torch.finfo(torch.float64).tiny
+    tolerance = SAFETY * error + floor * scale + torch.finfo(torch.float64).tiny
     clear = error <= CLEAR * scale
     return DerivativeCheck(name, numeric, error, reverse, forward, tolerance, clear, scale, refused)
 
 
 def _check_own(
-    function: Function, values: dict[str, Tensor], name: str, step: Tensor, levels: int, at_once: bool
+    function: Function, values: dict[str, Tensor], name: str, step: Tensor, levels: int, at_once: bool, floor: float
 ) -> DerivativeCheck:
     point = values[name]
 
@@ -149,6 +162,9 @@ def _check_own(
     out = of(leaf)
     columns = []
     for column in out.reshape(*point.shape, -1).unbind(-1):
+        if not out.requires_grad:  # a constant
+            columns.append(torch.zeros_like(point))
+            continue
         (slope,) = torch.autograd.grad(column.sum(), leaf, retain_graph=True, allow_unused=True)
         columns.append(torch.zeros_like(point) if slope is None else slope)
     reverse = torch.stack(columns, dim=-1).reshape(out.shape)
@@ -156,7 +172,8 @@ def _check_own(
         forward, refused = jvp(of, (point,), (torch.ones_like(point),))[1].detach()[None], ""
     except (RuntimeError, NotImplementedError) as error:
         forward, refused = None, str(error).split("\n")[0][:120]
-    return _compared(name, found.value[None], found.error[None], found.scale[None], reverse[None], forward, refused)
+    size = found.scale[None]
+    return _compared(name, found.value[None], found.error[None], size, reverse[None], forward, refused, floor)
 
 
 def _reverse(function: Function, values: dict[str, Tensor], name: str) -> Tensor:
@@ -168,9 +185,7 @@ def _reverse(function: Function, values: dict[str, Tensor], name: str) -> Tensor
     flat = out.reshape(-1)
     rows = torch.eye(len(flat), dtype=out.dtype)
     try:
-        (slopes,) = torch.autograd.grad(
-            flat, leaf, rows, is_grads_batched=True, allow_unused=True, retain_graph=True
-        )
+        (slopes,) = torch.autograd.grad(flat, leaf, rows, is_grads_batched=True, allow_unused=True, retain_graph=True)
     except RuntimeError:  # an operation whose backward pass has no batching rule
         each = [torch.autograd.grad(flat, leaf, row, retain_graph=True, allow_unused=True)[0] for row in rows]
         slopes = None if each[0] is None else torch.stack(each)

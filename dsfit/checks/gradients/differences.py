@@ -56,7 +56,8 @@ def derivative(
     - its share of the function's rounding noise, which is measured from differences of order 4 to 6 over a tiny grid
       (Hamming; More and Wild 2011, SIAM J. Sci. Comput. 33).
 
-    The entry with the least estimate is taken, for each element by itself.
+    The entry with the least estimate that entries of smaller steps do not contradict is taken, for each element by
+    itself.
 
     Args:
         along: maps t, of the shape of `step`, to values `[*step.shape, ...]` (any shape if `step` is a number).
@@ -80,8 +81,7 @@ def _extrapolated(near: Tensor, highs: Tensor, lows: Tensor, step: Tensor, ratio
     """From values over the tiny grid, and at the steps on either side, each `[levels, ...]`."""
     center = near[_NOISE_REACH]
     noise, relative = _noise(near)
-    best = torch.full_like(center, math.nan)
-    least = torch.full_like(center, math.inf)
+    rows: list[tuple[Tensor, Tensor]] = []  # the best entry of each row, and its estimate
     slopes: list[Tensor] = []  # the last row of the tableau, and of that of the jump of slope
     bends: list[Tensor] = []
     amplified = _amplification(len(highs), ratio)
@@ -89,6 +89,7 @@ def _extrapolated(near: Tensor, highs: Tensor, lows: Tensor, step: Tensor, ratio
         h = step / ratio**k
         # where f(0) is near a zero of f, the noise is that of its neighbours
         rough = torch.maximum(noise, relative * torch.maximum(high.abs(), low.abs()).nan_to_num())
+        best, least = torch.full_like(center, math.nan), torch.full_like(center, math.inf)
         slope_row, bend_row = [(high - low) / (2 * h)], [((high - center) + (low - center)) / h]
         for m in range(1, k + 1):
             slope_row.append(slope_row[-1] + (slope_row[-1] - slopes[m - 1]) / (ratio ** (2 * m) - 1))
@@ -98,7 +99,20 @@ def _extrapolated(near: Tensor, highs: Tensor, lows: Tensor, step: Tensor, ratio
             better = error < least  # never true for NaN
             best, least = torch.where(better, slope_row[m], best), torch.where(better, error, least)
         slopes, bends = slope_row, bend_row
-    return Difference(best, least, noise, center.abs())
+        rows.append((best, least))
+    return Difference(*_corroborated(rows), noise, center.abs())
+
+
+def _corroborated(rows: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """The entry with the least estimate, once each is raised to what rows of smaller steps, as far as they can tell,
+    find wrong with it: where f is only piecewise smooth, entries of large steps may agree by chance."""
+    best, least = torch.full_like(rows[0][0], math.nan), torch.full_like(rows[0][0], math.inf)
+    for k, (value, error) in enumerate(rows):
+        for finer, known in rows[k + 1 :]:
+            error = torch.maximum(error, ((value - finer).abs() - known).nan_to_num(nan=0.0, neginf=0.0))
+        better = error < least
+        best, least = torch.where(better, value, best), torch.where(better, error, least)
+    return best, least
 
 
 def _amplification(levels: int, ratio: float) -> list[float]:
