@@ -161,6 +161,7 @@ def test_lost_cosines_agree_with_the_conventions_own_reference() -> None:
     assert both == pytest.approx(ratio[0] / ratio[1], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_negative_light_agrees_with_the_printed_conventions_own_reference() -> None:
     wrong = dsfit.Integrand(bsdf().replace(convention="printed", precision="exact"))
     values = [float(dsfit.reference(scene, context(), 1e-3).value) for scene in (wrong, integrand())]
