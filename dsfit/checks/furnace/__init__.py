@@ -25,7 +25,8 @@ from dsfit.checks.furnace.energy import (
 )
 from dsfit.checks.furnace.limits import limits
 from dsfit.checks.furnace.model import energy_findings, known_findings, limit_findings, symmetry_findings
-from dsfit.checks.furnace.partition import NodeDensity, Partition, PartitionNodes, partition_nodes
+from dsfit.checks.furnace.nodes import NodeDensity, PartitionNodes, partition_nodes
+from dsfit.checks.furnace.partition import Partition
 from dsfit.checks.furnace.rings import WeightedCounts, WhiteFurnace, ring_light, weighted_counts, white_furnace
 from dsfit.checks.furnace.sampling import (
     Case,
@@ -126,9 +127,9 @@ def _contexts(furnace: Integrand, inclinations_deg: Sequence[float], n: Sequence
     for degrees in inclinations_deg:
         theta = math.radians(degrees)
         if isinstance(scattering, ConstantScattering) and scattering.from_context:
-            found += [(f"θ_r = {degrees:g}°, n = {x:g}", Context(theta, _PHI_R, x)) for x in n]
+            found += [(f"θᵣ = {degrees:g}°, n = {x:g}", Context(theta, _PHI_R, x)) for x in n]
         else:
-            found.append((f"θ_r = {degrees:g}°", scattering.hints(Context(theta, _PHI_R))))
+            found.append((f"θᵣ = {degrees:g}°", scattering.hints(Context(theta, _PHI_R))))
     return found
 
 

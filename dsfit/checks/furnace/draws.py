@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dsfit.checks.furnace.partition import IntegrandLike
+from dsfit.checks.furnace.nodes import IntegrandLike
 from dsfit.context import Context
 from dsfit.errors import InputError
 from dsfit.frame import HALF_PI

@@ -17,14 +17,13 @@ from scipy import special, stats
 from torch import Tensor
 
 from dsfit.checks.furnace.draws import Draws, draw
-from dsfit.checks.furnace.partition import IntegrandLike, NodeDensity, Partition, Rule, partition_nodes
+from dsfit.checks.furnace.nodes import CAP, IntegrandLike, NodeDensity, Rule, partition_nodes
+from dsfit.checks.furnace.partition import Partition
 from dsfit.context import Context
 from dsfit.proposals.base import Proposal
 
 EFFECTIVE = 40.0
 """Fewest effective samples of a cell, `N I^2 / S` and `1 / skewness^2`; neighbours are merged until they have them."""
-CAP = 40.0
-"""Largest weight of the ring test, in units of the mean."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,7 @@ def white_furnace(density: NodeDensity, draws: Draws) -> WhiteFurnace:
 
     sums, bounds = density.integrate(columns)
     value, second, third = sums.sum(0).chunk(3)
-    error = bounds.sum(0)[: len(value)]
+    error, second = bounds.sum(0)[: len(value)], second + bounds.sum(0)[len(value) : 2 * len(value)]
     estimate = draws.weights().sum(0) / draws.samples
     variance = (second - value**2).clamp_min(0.0)
     standard_error = torch.sqrt(variance / draws.samples)
@@ -146,8 +145,7 @@ def weighted_counts(
     partition = density.nodes.partition
     cells = torch.arange(partition.count) if cells is None else cells
     count = int(cells.max()) + 1
-    rule = density.nodes.fine
-    largest = cap * float((torch.linalg.vector_norm(rule.value, dim=-1) * rule.weight).sum())
+    largest = cap * density.nodes.total()
 
     def columns(rule: Rule, p: Tensor) -> Tensor:
         norm, mixed = torch.linalg.vector_norm(rule.value, dim=-1), draws.mixed(p)
@@ -159,6 +157,7 @@ def weighted_counts(
     weight = torch.linalg.vector_norm(draws.weights(), dim=-1).clamp_max(largest)
     where = cells[partition.cell(draws.omega, draws.context)]
     sampled = torch.zeros(count, dtype=weight.dtype).index_add_(0, where, weight) / draws.samples
+    sums[:, 1] += bounds[:, 1]  # a variance is a small difference where p is good: grant the quadrature its error
     return _compare(sums, bounds[:, 0], sampled, draws)
 
 
@@ -204,45 +203,53 @@ def merge_cells(moments: Tensor, samples: int, least: float = EFFECTIVE) -> Tens
     """Group number of every cell `[K]`, -1 for cells that are left out. Nothing that was sampled enters.
 
     A group's weighted count needs `least` effective samples by variance, `N I^2 / S`, and by skewness, `N S^3 / T^2`.
-    Cells that have them stand alone; the others are pooled, those of small weights first, as long as that helps. What
-    is then left, cells that are hit too rarely for the weight they carry, cannot be judged.
+    Cells that have them stand alone. The others are pooled from the largest weights down, as cells of smaller weights
+    only ever help; a cell that all smaller ones cannot help enough is hit too rarely for the weight it carries, and is
+    left out.
 
     Args:
         moments: int_k w^(m - 1) |f| for m = 1, 2, 3, `[K, 3]`: I, S, T.
         samples: N.
     """
+    rows = moments.tolist()
 
-    def effective(m: Tensor) -> float:
-        i, s, t = m.tolist()
+    def effective(i: float, s: float, t: float) -> float:
         return 0.0 if min(i, s, t) <= 0 else samples * min(i * i / s, s**3 / t**2)
 
-    group = torch.full((len(moments),), -1)
-    alone = [k for k, m in enumerate(moments) if effective(m) >= least]
+    alone = [k for k, row in enumerate(rows) if effective(*row) >= least]
+    group = torch.full((len(rows),), -1)
     group[alone] = torch.arange(len(alone))
-    rest = sorted(
-        set(range(len(moments))) - set(alone), key=lambda k: float(moments[k, 2] / moments[k, 1].clamp_min(1e-300))
-    )
-    current, pool, members = len(alone), torch.zeros_like(moments[0]), []
-    for k in rest:
-        if effective(pool + moments[k]) < effective(pool):
-            continue
-        pool, members = pool + moments[k], [*members, k]
-        if effective(pool) >= least:
-            group[members] = current
-            current, pool, members = current + 1, torch.zeros_like(pool), []
+    lone = set(alone)
+    rest = [k for k, row in enumerate(rows) if k not in lone and min(row) > 0]
+    rest.sort(key=lambda k: -rows[k][2] / rows[k][1])
+    current, start = len(alone), 0
+    while start < len(rest):
+        pool = [0.0, 0.0, 0.0]
+        for end in range(start, len(rest)):
+            pool = [a + b for a, b in zip(pool, rows[rest[end]], strict=True)]
+            if effective(*pool) >= least:
+                group[rest[start : end + 1]] = current
+                current, start = current + 1, end + 1
+                break
+        else:
+            start += 1
     return group
 
 
 def quadratic_form(difference: Tensor, covariance: Tensor) -> tuple[float, int]:
-    """`d^T C^-1 d` and the rank of C. Infinite where d leaves the range of C: with weights all equal, the total has no
-    variance, and must be right to rounding."""
-    if not bool(difference.isfinite().all() and covariance.isfinite().all()):
+    """`d^T C^-1 d` and the rank of C.
+
+    Infinite where d leaves the range of C (with weights all equal the total has no variance, and must be right to
+    rounding), and where C has negative variances: `int f^2/p < (int f)^2` takes a p that integrates to more than 1.
+    """
+    variance = covariance.diagonal()
+    if not bool(difference.isfinite().all() and covariance.isfinite().all() and (variance >= 0).all()):
         return math.inf, 0
-    scale = torch.sqrt(covariance.diagonal()).clamp_min(1e-150)
+    scale = torch.sqrt(variance).clamp_min(1e-150)
     values, vectors = torch.linalg.eigh(covariance / (scale[:, None] * scale))
     along = vectors.T @ (difference / scale)
     used = values > 1e-10
-    if bool((along[~used].abs() > 1e-4).any()):
+    if bool((values < -1e-6).any()) or bool((along[~used].abs() > 1e-4).any()):
         return math.inf, int(used.sum())
     return float((along[used] ** 2 / values[used]).sum()), int(used.sum())
 

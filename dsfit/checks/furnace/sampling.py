@@ -19,8 +19,9 @@ from dsfit.checks.furnace.controls import (
     ScaledDensity,
 )
 from dsfit.checks.furnace.draws import Draws, draw
-from dsfit.checks.furnace.partition import NodeDensity, Partition, PartitionNodes, partition_nodes
-from dsfit.checks.furnace.rings import CAP, WeightedCounts, WhiteFurnace, weighted_counts, white_furnace
+from dsfit.checks.furnace.nodes import CAP, NodeDensity, PartitionNodes, partition_nodes
+from dsfit.checks.furnace.partition import Partition
+from dsfit.checks.furnace.rings import WeightedCounts, WhiteFurnace, weighted_counts, white_furnace
 from dsfit.checks.furnace.weights import SampleWeights, material_consistency, sample_weights
 from dsfit.context import Context
 from dsfit.material import Material
