@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import torch
-from scipy import stats
 from torch import Tensor
 
+from dsfit.checks.chi_square import pooled_chi_square
 from dsfit.context import Context
 from dsfit.frame import HALF_PI, cos_inclination, wrap
 from dsfit.proposals.base import Distribution
@@ -77,19 +77,5 @@ def counts(omega: Tensor, context: Context, cells: tuple[int, int]) -> Tensor:
 
 
 def chi_square(observed: Tensor, probability: Tensor) -> float:
-    """p-value of counts against cell probabilities; cells of expected count below 5 are pooled into one."""
-    observed, expected = observed.double().flatten(), probability.flatten() * observed.sum()
-    rare = expected < 5
-    seen, wanted = observed[~rare], expected[~rare]
-    pool_seen, pool_wanted = observed[rare].sum(), expected[rare].sum()
-    if pool_wanted >= 5 or len(wanted) == 0:
-        seen, wanted = torch.cat([seen, pool_seen[None]]), torch.cat([wanted, pool_wanted[None]])
-    else:  # too rare even together: into the rarest cell that stands alone
-        k = int(wanted.argmin())
-        seen, wanted = seen.clone(), wanted.clone()
-        seen[k] += pool_seen
-        wanted[k] += pool_wanted
-    if len(wanted) < 2:
-        return 1.0
-    statistic = float(((seen - wanted) ** 2 / wanted).sum())
-    return float(stats.chi2.sf(statistic, len(wanted) - 1))
+    """p-value of counts against cell probabilities, by the library's own test."""
+    return pooled_chi_square(observed, probability * observed.sum())[0]
