@@ -113,7 +113,7 @@ def test_a_saved_proposal_is_checked(config: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ('check.proposals=["R", "TTT"]', ("check.proposals[1]", "one of R")),
+        ('check.proposals=["R", "TTT"]', ("check.proposals.1", "did you mean 'TT'")),
         ('check.suites=["chi"]', ("check.suites", "chi_square")),
         ('check.saved=["nothing.npz"]', ("check.saved", "nothing.npz")),
         ('check.user=["nothing.py:f"]', ("check.user", "file.py:function")),
