@@ -6,7 +6,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from dsfit.context import Context
 from dsfit.errors import InputError, check_choice
-from dsfit.fit.objectives import Objective, Target, excess_residuals, objective_named
+from dsfit.fit.objectives import LOG_FLOOR, Objective, Target, excess_residuals, objective_named
 from dsfit.fit.proposal_problem import Parameters, ProposalProblem
 from dsfit.fit.solvers import minimise, solver_named
 from dsfit.fit.tracking import HistoryEntry, SolverResult
@@ -24,9 +24,14 @@ AT_BOUND = 1e-3
 value is at a bound."""
 
 
-NATURAL = {"floor": 1e-3, "damping": 0.1, "reach": 2.0}
-"""Solver options of a fit, where one unit of a parameter is one radian, one e-fold or one unit of a logit: steps
-longer than 2 kill components of a mixture by throwing them where no derivative brings them back."""
+REACH = 2.0
+"""Longest step of a parameter in a fit, where one unit is one radian, one e-fold or one unit of a logit: longer steps
+kill components of a mixture by throwing them where no derivative brings them back."""
+
+NATURAL = {"floor": 0.1, "damping": 0.1}
+"""Solver options of a fit. The parameters already have units of their own, so that their scales may differ by a factor
+of 10 only: a component with a small share has small derivatives at the start, and in scales of its own it would be
+thrown far away by the first steps."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,8 @@ class Fit:
 
     Attributes:
         proposal: the fitted copy, in the dtype of the one given; that one is unchanged.
-        excess: `M / M* - 1` with the mass correction of `objectives`, never negative; mean over contexts.
+        excess: `M / M* - 1` with the mass correction of `objectives`, never negative; mean over contexts. inf where the
+            density vanishes at a node and the integrand does not; such a fit has not converged.
         largest_weight: `sup |F| / (p int |F|)` over nodes and contexts: the largest sample in units of the mean.
         mass: `int p` as the nodes see it, furthest from 1 over contexts; a fit whose mass is off hides lobes between
             the nodes.
@@ -84,6 +90,7 @@ def fit(
     max_steps: int | None = None,
     tolerance: float = 1e-4,
     max_seconds: float = math.inf,
+    reach: float = REACH,
     jacobian: str = "auto",
     **options: Any,
 ) -> Fit:
@@ -104,7 +111,7 @@ def fit(
             in the order of the flattened batch, for a batch of contexts. Left out,
             `dsfit.quality.quadrature_nodes(integrand, context, rtol=rtol)` makes them.
         weights: positive weights of the contexts in the mean, of the batch's shape.
-        max_steps, tolerance: see `minimise`.
+        max_steps, tolerance, reach: see `minimise`.
         max_seconds: wall time for all starts together.
         jacobian: "auto", "own", "reverse" or "forward"; see `ProposalProblem`.
         options: further options of the solver.
@@ -139,7 +146,7 @@ def fit(
         noise = torch.randn(len(y0), generator=generator, dtype=torch.float64)
         start = y0 if number == 0 else y0 + jitter * noise
         try:
-            limits = {"max_steps": max_steps, "tolerance": tolerance, "max_seconds": left}
+            limits = {"max_steps": max_steps, "tolerance": tolerance, "max_seconds": left, "reach": reach}
             results.append(minimise(problem, start, solver, **limits, **options))
         except InputError as error:
             # A moved start may have no finite value; the given one must.
@@ -150,7 +157,13 @@ def fit(
     parameters.assign(fitted, best.y)
     # What is reported is what is returned: after rounding to the proposal's own dtype.
     parameters.assign(work, parameters.vector(fitted))
-    excesses, masses, largest = quality(work, targets)
+    excesses, masses, largest, bare = quality(work, targets)
+    if bare:
+        best = replace(
+            best,
+            converged=False,
+            reason=f"{best.reason}; yet the density vanishes at {bare} nodes where the integrand does not",
+        )
     shares = torch.tensor([target.share for target in targets], dtype=torch.float64)
     return Fit(
         proposal=fitted,
@@ -219,17 +232,22 @@ def make_targets(
 
 
 @torch.no_grad()
-def quality(proposal: nn.Module, targets: Sequence[Target]) -> tuple[Tensor, Tensor, Tensor]:
-    """Excess, mass `int p` and largest weight `sup P* / p` of a float64 proposal, per target [B]."""
-    rows = []
+def quality(proposal: nn.Module, targets: Sequence[Target]) -> tuple[Tensor, Tensor, Tensor, int]:
+    """Excess, mass `int p` and largest weight `sup P* / p` of a float64 proposal, per target [B]; and the number of
+    nodes where the integrand is not zero but the density is, or all but (below `LOG_FLOOR`): the excess is inf there.
+    """
+    rows, bare = [], 0
     for target in targets:
         log_p = proposal(target.context).log_prob(target.omega)
         residuals = excess_residuals(log_p, target.weight, target.log_best)
         seen = (target.weight > 0) & (target.log_best > -math.inf)
         largest = torch.exp((target.log_best - log_p)[seen].max())
-        rows.append([float(residuals.square().sum()), float((target.weight * log_p.exp()).sum()), float(largest)])
+        missed = int((seen & ~(log_p >= LOG_FLOOR)).sum())
+        excess = math.inf if missed else float(residuals.square().sum())
+        bare += missed
+        rows.append([excess, float((target.weight * log_p.exp()).sum()), float(largest)])
     excess, mass, largest = torch.tensor(rows, dtype=torch.float64).unbind(-1)
-    return excess, mass, largest
+    return excess, mass, largest, bare
 
 
 @torch.no_grad()

@@ -85,7 +85,8 @@ class Target:
         if not total > 0:
             raise InputError("nodes.value", 0.0, "an integrand that is not zero at every node of positive weight")
         mean = (weight[:, None] * value / largest).sum(0).norm()
-        return cls(context, omega, weight, torch.log(length / total), total * largest, float(mean / total) ** 2, share)
+        grey = min(float(mean / total), 1.0) ** 2  # rounding may take it above 1 for a single channel
+        return cls(context, omega, weight, torch.log(length / total), total * largest, grey, share)
 
 
 class Objective(ABC):

@@ -9,10 +9,10 @@ Variables are scaled (`tracking.column_scale`). Residuals are scaled by one fact
 Levenberg-Marquardt parameter, which is always 1, equals `damping` times the largest diagonal element of J^T J (Madsen,
 Nielsen and Tingleff 2004, section 3.2).
 
-Convergence of the least-squares solvers, at an accepted point: the undamped Gauss-Newton step promises a relative
-decrease of the value below `tolerance` (scale-free), or the value is below `absolute`, or five accepted steps together
-brought less than that. For all solvers: optimistix's own test, made so strict that it means "no further step possible
-in float64".
+Convergence of the least-squares solvers, at an accepted point: the undamped Gauss-Newton step, no longer than `reach`,
+promises a relative decrease of the value below `tolerance`, or the value is below `absolute`, or five accepted steps
+together brought less than that. For all solvers: optimistix's own test, made so strict that it means "no further step
+possible in float64".
 """
 
 from __future__ import annotations
@@ -220,7 +220,7 @@ def least_squares(
         if not moved or latest[1] == float("inf"):
             return ""
         accepted = latest
-        gap = relative_gap(accepted[2], accepted[3] / scale, absolute)
+        gap = relative_gap(accepted[2], accepted[3], absolute, reach)
         if accepted[1] <= absolute:
             return "the value is zero"
         if gap <= tolerance:

@@ -12,6 +12,7 @@ rows as with ten thousand.
 
 from __future__ import annotations
 
+import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -51,22 +52,49 @@ def compress(residuals: Tensor, jacobian: Tensor, *, rows: int = 65536) -> tuple
     return factor[:, -1], factor[:, :-1]
 
 
-def gauss_newton_gap(residuals: Tensor, jacobian: Tensor, *, rcond: float = 1e-9) -> float:
+def gauss_newton_gap(residuals: Tensor, jacobian: Tensor, *, rcond: float = 1e-9, reach: float = float("inf")) -> float:
     """By how much an undamped Gauss-Newton step promises to lower `sum r^2`: the squared norm of r projected on the
     range of J.
 
     The range is taken as the left singular vectors of J, its columns scaled to unit length first, whose singular value
     exceeds `rcond` times the largest, so that neither the units of the parameters nor directions that are only
     rounding noise matter. NaN for non-finite input.
+
+    Where that step moves a parameter by more than `reach`, the linear model is believed only so far: the result is
+    what the best step of length `reach sqrt(P)` promises, which is at least what any step within reach does. A
+    parameter close to a bound that lies at infinity, such as the logit of a share that vanishes, promises nothing.
     """
     if not bool(torch.isfinite(residuals).all() & torch.isfinite(jacobian).all()):
         return float("nan")
     length = jacobian.norm(dim=0)
-    scaled = jacobian / torch.where(length > 0, length, 1.0)
-    u, s, _ = torch.linalg.svd(scaled, full_matrices=False)
+    length = torch.where(length > 0, length, 1.0)
+    u, s, vh = torch.linalg.svd(jacobian / length, full_matrices=False)
     if not len(s) or not s[0] > 0:
         return 0.0
-    return float((u.T @ residuals)[s > rcond * s[0]].square().sum())
+    kept = s > rcond * s[0]
+    along = (u.T @ residuals)[kept]
+    step = (vh[kept].T @ (along / s[kept])) / length
+    promise = float(along.square().sum())
+    if not float(step.abs().max()) > reach:
+        return promise
+    return min(promise, _promise_within(residuals, jacobian, reach * len(step) ** 0.5))
+
+
+def _promise_within(residuals: Tensor, jacobian: Tensor, radius: float) -> float:
+    """The most by which `|r + J x|^2` falls below `|r|^2` for |x| <= radius, by bisection for the multiplier `mu` of
+    `x = -(J^T J + mu)^-1 J^T r`, whose length falls as mu grows."""
+    u, s, _ = torch.linalg.svd(jacobian, full_matrices=False)
+    along = u.T @ residuals
+    low, high = -80.0, 80.0  # logarithm of mu in units of s_max^2
+    for _ in range(100):
+        middle = 0.5 * (low + high)
+        damped = s.square() + s[0].square() * math.exp(middle)
+        if float((s * along / damped).norm()) > radius:
+            low = middle
+        else:
+            high = middle
+    share = s.square() / (s.square() + s[0].square() * math.exp(low))  # the longer side: never too small a promise
+    return float((along.square() * share * (2 - share)).sum())
 
 
 def forward_jacobian(

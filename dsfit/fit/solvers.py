@@ -42,14 +42,14 @@ class Solver:
 
 _OPTIMISTIX, _TORCH = "dsfit.fit.optimistix_solvers", "dsfit.fit.torch_solvers"
 
-_FLOOR, _REACH = {"floor": 1e-8}, {"reach": float("inf")}
+_FLOOR = {"floor": 1e-8}
 
 SOLVERS: dict[str, Solver] = {
     solver.name: solver
     for solver in (
-        Solver("optimistix.lm", True, 100, _OPTIMISTIX, "least_squares", {**_FLOOR, "damping": 1e-3, **_REACH}),
+        Solver("optimistix.lm", True, 100, _OPTIMISTIX, "least_squares", {**_FLOOR, "damping": 1e-3}),
         Solver("optimistix.gauss_newton", True, 100, _OPTIMISTIX, "least_squares", {**_FLOOR}),
-        Solver("optimistix.dogleg", True, 100, _OPTIMISTIX, "least_squares", {**_FLOOR, **_REACH}),
+        Solver("optimistix.dogleg", True, 100, _OPTIMISTIX, "least_squares", {**_FLOOR}),
         Solver("optimistix.bfgs", False, 500, _OPTIMISTIX, "bfgs", {**_FLOOR}),
         Solver("optimistix.nelder_mead", False, 10000, _OPTIMISTIX, "nelder_mead", {**_FLOOR, "simplex": 0.3}),
         Solver("torch.lbfgs", False, 500, _TORCH, "lbfgs", {**_FLOOR, "memory": 20}),
@@ -77,6 +77,7 @@ def minimise(
     tolerance: float = 1e-6,
     absolute: float = 1e-14,
     max_seconds: float = float("inf"),
+    reach: float = float("inf"),
     **options: Any,
 ) -> SolverResult:
     """Minimise a function of a parameter vector.
@@ -89,11 +90,12 @@ def minimise(
         tolerance: converged when a step promises, or a few steps brought, a relative decrease of the value below this.
         absolute: ... or a decrease below this; also the value that counts as zero.
         max_seconds: wall time after which to stop, checked between steps.
+        reach: the longest step of any one parameter over which a linear model is believed. Solvers that can refuse a
+            longer one unevaluated, and the convergence of all is judged by what a step within reach promises.
         options: further options of the solver (`SOLVERS[name].options`): `floor` of the scales of the variables
-            (`tracking.column_scale`); first `damping` relative to the largest element of J^T J; `reach`, the longest
-            step of any one parameter (a longer one is refused unevaluated); first edge of the `simplex`; `memory` of
-            L-BFGS; first and final learning rate of Adam (`rate`, `final_rate`), and how many `contexts` to
-            draw for each of its steps (0: all), with which `seed`.
+            (`tracking.column_scale`); first `damping` relative to the largest element of J^T J; first edge of the
+            `simplex`; `memory` of L-BFGS; first and final learning rate of Adam (`rate`, `final_rate`), and how many
+            `contexts` to draw for each of its steps (0: all), with which `seed`.
 
     Returns:
         `SolverResult`; numerical failure is not an exception but a `reason`, with the best point seen.
@@ -106,6 +108,8 @@ def minimise(
         raise InputError("y0", tuple(y0.shape), "a vector of at least one parameter")
     if not tolerance > 0:
         raise InputError("tolerance", tolerance, "numbers > 0")
+    if not reach > 0:
+        raise InputError("reach", reach, "numbers > 0")
     if max_steps is not None and max_steps < 0:
         raise InputError("max_steps", max_steps, "integers >= 0")
     start = check_finite("y0", y0.detach().to("cpu", torch.float64))
@@ -116,11 +120,16 @@ def minimise(
         raise InputError("options", unknown, f"options of {solver}: {sorted(entry.options) or 'none'}")
     tracker = Tracker(problem, start, max_seconds)
     limit = entry.max_steps if max_steps is None else max_steps
-    result = entry.run(tracker, max_steps=limit, tolerance=tolerance, absolute=absolute, **{**entry.options, **options})
-    return _judged(result, tracker, tolerance, absolute)
+    limits = {"max_steps": limit, "tolerance": tolerance, "absolute": absolute}
+    if entry.least_squares:
+        limits["reach"] = reach
+    result = entry.run(tracker, **limits, **{**entry.options, **options})
+    return _judged(result, tracker, tolerance, absolute, reach)
 
 
-def _judged(result: SolverResult, tracker: Tracker, tolerance: float, absolute: float) -> SolverResult:
+def _judged(
+    result: SolverResult, tracker: Tracker, tolerance: float, absolute: float, reach: float = float("inf")
+) -> SolverResult:
     """Judge least-squares results of all solvers alike, by what a Gauss-Newton step from the best point promises.
 
     Stopped for lack of progress is not converged if that is more than sqrt(tolerance); stopped otherwise is converged
@@ -130,12 +139,12 @@ def _judged(result: SolverResult, tracker: Tracker, tolerance: float, absolute: 
         return result
     if result.gap is None or not torch.equal(result.y, tracker.linearised_at):
         _, residuals, jacobian = tracker.linearise(result.y)
-        result = replace(result, gap=relative_gap(residuals, jacobian, absolute))
+        result = replace(result, gap=relative_gap(residuals, jacobian, absolute, reach))
     assert result.gap is not None
     if result.converged and not result.gap <= tolerance**0.5:
-        reason = f"{result.reason}; yet a Gauss-Newton step promises a relative decrease of {result.gap:.1e}"
+        reason = f"{result.reason}; yet a Gauss-Newton step from the best point promises {result.gap:.1e}"
         return replace(result, converged=False, reason=reason)
     if not result.converged and result.gap <= tolerance:
-        reason = f"{result.reason}; but a Gauss-Newton step promises a relative decrease of only {result.gap:.1e}"
+        reason = f"{result.reason}; but a Gauss-Newton step from the best point promises only {result.gap:.1e}"
         return replace(result, converged=True, reason=reason)
     return result

@@ -17,10 +17,12 @@ class _Closure:
     def __init__(self, tracker: Tracker, parameter: Tensor, scale: Tensor, factor: float) -> None:
         self.tracker, self.parameter, self.scale, self.factor = tracker, parameter, scale, factor
         self.gradient = torch.zeros_like(parameter)
+        self.at = tracker.y0
 
     def __call__(self) -> Tensor:
         tracker = self.tracker
         y = tracker.y0 + self.parameter.detach() / self.scale
+        self.at = y
         if bool(torch.isfinite(y).all()):
             value, gradient = tracker.gradient(y)
         else:
@@ -63,7 +65,7 @@ def lbfgs(
         if torch.equal(before, parameter.detach()) or not bool(torch.isfinite(parameter).all()):
             # The line search found no descent: once more from the best point without memory, then give up.
             if restarted:
-                flat = not bool((closure.gradient != 0).any())
+                flat = not bool((closure.gradient != 0).any()) and torch.equal(closure.at, tracker.best_y)
                 reason = "the gradient is zero" if flat else "the line search finds no descent"
                 return tracker.result(name, count, flat, reason)
             restarted = True
@@ -93,7 +95,8 @@ def adam(
     parameters.
 
     Converged when a tenth of `max_steps` (at least 50 steps) no longer lowered the best value by more than the
-    tolerance. A step onto a point without a finite value goes back to the best point with half the rate. With
+    tolerance. A step onto a point without a finite value, or onto a plateau without a gradient that is not the best
+    point, goes back to the best point with half the rate. With
     `contexts`, a step sees only that many contexts, drawn at random; the value is then taken every 1/40 of `max_steps`
     and at the end, and convergence is not judged before.
     """
@@ -118,12 +121,13 @@ def adam(
             optimizer.step(closure)
         tracker.check()
         tracker.record(count)
-        if tracker.bad > bad:
+        flat = contexts <= 0 and not bool((closure.gradient != 0).any())
+        if tracker.bad > bad or (flat and not torch.equal(closure.at, tracker.best_y)):
             shrink *= 0.5
             optimizer.state.clear()
             with torch.no_grad():
                 parameter.copy_(tracker.best_y - tracker.y0)
-        elif contexts <= 0 and not bool((closure.gradient != 0).any()):
+        elif flat:
             return tracker.result(name, count, True, "the gradient is zero")
         if tracker.problem.least_squares and tracker.best_value <= absolute:
             return tracker.result(name, count, True, "the value is zero")

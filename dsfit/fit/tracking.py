@@ -44,8 +44,8 @@ class SolverResult:
         evaluations: calls of the function, those with derivatives included.
         derivatives: how many of these computed a gradient or Jacobian.
         converged: whether a convergence criterion was met; `reason` says which, or what stopped the solver instead.
-        gap: by how much a Gauss-Newton step from the last accepted point promises to lower the value (least-squares
-            solvers only).
+        gap: share of the value by which a Gauss-Newton step from the best point, no longer than `reach`, promises to
+            lower it (least-squares problems only).
         history: one entry per step.
         seconds: wall time, compilation included; `compile_seconds` of them went into compiling JAX programs.
     """
@@ -216,10 +216,10 @@ class Stall:
         return self.values[-self.window - 1] - value <= self.tolerance * abs(value) + self.absolute
 
 
-def relative_gap(residuals: Tensor, jacobian: Tensor, absolute: float) -> float:
+def relative_gap(residuals: Tensor, jacobian: Tensor, absolute: float, reach: float = float("inf")) -> float:
     """`gauss_newton_gap` as a share of the value, which is floored by `absolute`."""
     value = float(residuals.square().sum())
-    return gauss_newton_gap(residuals, jacobian) / max(value, absolute, torch.finfo(torch.float64).tiny)
+    return gauss_newton_gap(residuals, jacobian, reach=reach) / max(value, absolute, torch.finfo(torch.float64).tiny)
 
 
 def column_scale(jacobian: Tensor, floor: float) -> Tensor:
