@@ -111,7 +111,9 @@ def show(
     try:
         directory = RunDirectory(rundir)
         _report(directory, directory.result(), draw=plots)
-    except (InputError, KeyError, TypeError, IndexError) as error:
+    except OSError as error:
+        _fail(f"{rundir}: {error}", 1)
+    except (InputError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         text = (
             str(error)
             if isinstance(error, InputError)
@@ -132,7 +134,9 @@ def presets() -> None:
 
 def _console() -> Console:
     """Standard output; as wide as the table needs where it is not a terminal."""
-    return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=170)
+    # names and paths are shown as they are, whatever is in brackets
+    plain = {"highlight": False, "markup": False, "emoji": False}
+    return Console(**plain) if sys.stdout.isatty() else Console(**plain, width=170)
 
 
 def _report(directory: RunDirectory, result: dict[str, Any], draw: bool) -> None:

@@ -76,7 +76,12 @@ class RunDirectory:
         Raises:
             InputError: there is none (an unfinished run or no run directory at all), or it is damaged.
         """
-        if not (self.path / "result.json").exists():
+        try:
+            there = (self.path / "result.json").exists()
+        except (OSError, ValueError) as error:  # a name too long, a folder that may not be read
+            reason = getattr(error, "strerror", None) or str(error)
+            raise InputError(str(self.path), reason, "the directory of a finished run") from None
+        if not there:
             unfinished = (self.path / "config.toml").exists()
             state = "an unfinished run: give its config to `dsfit run` again" if unfinished else "no result.json there"
             raise InputError(str(self.path), state, "the directory of a finished run")

@@ -9,6 +9,7 @@ call; everything else by its attributes.
 from __future__ import annotations
 
 import functools
+import hashlib
 import importlib
 import io
 import json
@@ -48,6 +49,7 @@ def save_proposal(path: str | Path, proposal: nn.Module) -> None:
     writer = _Writer()
     root = writer.node(proposal, "proposal")
     header = {"format": "dsfit proposal", "schema_version": PROPOSAL_SCHEMA, "dsfit": code_version(), "root": root}
+    header["checksum"] = _checksum(root, writer.arrays)
     arrays = {_HEADER: np.frombuffer(json.dumps(header, allow_nan=False).encode(), dtype=np.uint8), **writer.arrays}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
@@ -69,6 +71,8 @@ def load_proposal(path: str | Path) -> Any:
         header = json.loads(arrays.pop(_HEADER).tobytes().decode("utf-8"))
         if header["format"] != "dsfit proposal" or header["schema_version"] != PROPOSAL_SCHEMA:
             raise InputError(str(path), f"schema version {header['schema_version']}", allowed)
+        if header.get("checksum", None) not in (None, _checksum(header["root"], arrays)):
+            raise InputError(str(path), "damaged: contents that do not match their checksum", allowed)
         proposal = _Reader(arrays).value(header["root"])
     except InputError as error:
         raise InputError(str(path), str(error), allowed) from None
@@ -77,6 +81,14 @@ def load_proposal(path: str | Path) -> Any:
     if not isinstance(proposal, Proposal):
         raise InputError(str(path), type(proposal).__name__, allowed)
     return proposal
+
+
+def _checksum(root: Any, arrays: dict[str, np.ndarray]) -> str:
+    """SHA-256 of the structure and of every array with its name, dtype and shape."""
+    digest = hashlib.sha256(json.dumps(root, sort_keys=True).encode())
+    for name, array in sorted(arrays.items()):
+        digest.update(f"\0{name} {array.dtype.str} {array.shape}\0".encode() + array.tobytes())
+    return digest.hexdigest()
 
 
 def _compact(value: Any) -> dict[str, Any] | None:

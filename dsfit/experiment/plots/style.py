@@ -11,6 +11,7 @@ from typing import Any
 import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from dsfit.experiment.files import write_bytes
 
@@ -57,6 +58,7 @@ def look(index: int) -> dict[str, Any]:
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     """Write `name.png` and `name.pdf` atomically; returns the two paths."""
     paths = []
+    _plain(figure)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # laid out once, not once more for every format
     for kind in ("png", "pdf"):
@@ -65,6 +67,14 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
         write_bytes(folder / f"{name}.{kind}", buffer.getvalue())
         paths.append(folder / f"{name}.{kind}")
     return paths
+
+
+def _plain(figure: Figure) -> None:
+    """Titles and labels as they are: two dollars in a method's name do not start a formula (those of ticks do)."""
+    ticks = {id(label) for axes in figure.axes for axis in (axes.xaxis, axes.yaxis) for label in axis.get_ticklabels()}
+    for text in figure.findobj(Text):
+        if id(text) not in ticks:
+            text.set_parse_math(False)
 
 
 def spread(count: int, most: int) -> list[int]:
