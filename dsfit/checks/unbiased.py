@@ -1,5 +1,5 @@
-"""Every estimator against the reference by quadrature: each proposal beside the uniform sphere, and all of them together
-under every MIS heuristic, in the multi-sample and in the one-sample model.
+"""Every estimator against the reference by quadrature: each proposal beside the uniform sphere, and all of them
+together under every MIS heuristic, in the multi-sample and in the one-sample model.
 
 Chapter eqs (1)-(3). What chi-square cannot see, this does: MIS weights that do not sum to one, an integrand and a
 density in different measures, counts that do not match the weights.
@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from scipy import stats
@@ -29,6 +29,7 @@ MODELS = ("multi", "one")
 HEURISTICS = ("balance", "power", "maximum", "cutoff", "optimal")
 MOST_ERROR = 0.1  # relative standard error beyond which agreement proves nothing
 BLOCKS = 32
+_FEWEST = 4
 
 
 @dataclass(frozen=True)
@@ -40,12 +41,14 @@ class Agreement:
         z: largest deviation of a channel in standard errors.
         relative_error: largest standard error of a channel, relative to the reference.
         truth_error: largest error bound of the reference, in standard errors.
+        claimed: standard error that the estimates claim over that of their spread, mean over channels.
     """
 
     p_value: float
     z: float
     relative_error: float
     truth_error: float
+    claimed: float = math.nan
 
 
 def agreement(
@@ -78,8 +81,9 @@ def agreement(
     many = context.expand(BLOCKS)
     found = estimate(
         integrand, list(proposals), many, samples // BLOCKS, heuristic, generator=generator, model=model, test=False
-    ).value
-    return hotelling(found, truth.value, truth.error)
+    )
+    claimed = torch.sqrt(found.standard_error.square().mean(dim=0) / found.value.var(dim=0).clamp_min(1e-300)).mean()
+    return replace(hotelling(found.value, truth.value, truth.error), claimed=float(claimed))
 
 
 def hotelling(values: Tensor, truth: Tensor, truth_error: Tensor) -> Agreement:
@@ -123,13 +127,32 @@ def run(
         cases = [(name, [proposal, uniform], "balance") for name, proposal in subject.proposals.items()]
         together = [*subject.proposals.values(), uniform]
         cases += [("all", together, heuristic) for heuristic in heuristics]
-        outcome = Outcome()
+        outcome, claimed = Outcome(), []
         for k, ((name, strategies, heuristic), model) in enumerate(itertools.product(cases, MODELS)):
             say(f"{name}: {heuristic}, {model}")
             generator = torch.Generator().manual_seed(subject.seed + 104_729 * k)
             found = agreement(integrand, strategies, context, truth, samples, heuristic, model, generator=generator)
             outcome.findings.append(_finding(f"{name}, {heuristic}, {model}-sample", subject.label, found))
+            if found.relative_error < MOST_ERROR:
+                claimed.append(found.claimed)
+    outcome.findings.append(_claimed(claimed, subject.label))
     return outcome
+
+
+def _claimed(ratios: list[float], case: str) -> Finding:
+    """Whether estimates know their own error: the ratio of one case scatters by 1/sqrt(2 `BLOCKS`), their median by
+    less."""
+    found = sorted(ratios)[len(ratios) // 2] if ratios else math.nan
+    return Finding(
+        SUITE,
+        "claimed standard errors",
+        case,
+        value=max(found, 1 / found) if found > 0 else math.inf,
+        bound=1 + 1.25 * 5 / math.sqrt(2 * BLOCKS * max(len(ratios), 1)),
+        unclear=None if len(ratios) >= _FEWEST else f"{len(ratios)} estimates of small error: too few to judge theirs",
+        detail=f"claimed over measured: median {found:.3f} of {len(ratios)} estimators",
+        data={"ratios": ratios},
+    )
 
 
 def _finding(subject: str, case: str, found: Agreement) -> Finding:

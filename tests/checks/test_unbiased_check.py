@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from unittest import mock
 
@@ -79,7 +80,7 @@ def test_run_says_where_it_cannot_tell() -> None:
     black = dsfit.Integrand(dsfit.DualScattering(dsfit.Fiber.preset("black", beta=torch.full((3,), 1e-3).double())))
     subject = Subject(black, dsfit.Context(0.3), {"uniform": UniformSphere()}, "black", 5)
     outcome = run(subject, samples=1000, heuristics=["balance"], rtol=1e-4)
-    assert all(v == "unclear" for _, v in judge(outcome.findings)) and len(outcome.findings) == 4
+    assert all(v == "unclear" for _, v in judge(outcome.findings)) and len(outcome.findings) == 5
 
 
 def test_run_passes_on_the_chapters_proposals() -> None:
@@ -88,3 +89,20 @@ def test_run_passes_on_the_chapters_proposals() -> None:
     outcome = run(subject, samples=20_000)
     verdicts = [v for _, v in judge(outcome.findings)]
     assert "fail" not in verdicts and verdicts.count("pass") > 8
+
+
+def test_wrong_error_bars_are_rejected() -> None:
+    """Half the standard error claimed: the value is right, the claim is not."""
+    chapter = chapter_proposals(BSDF)
+    subject = Subject(INTEGRAND, CONTEXT, {k: chapter[k] for k in ("TT", "MG_TT", "back")}, "blond", 6)
+    original = dsfit.mis.estimate
+
+    def optimistic(*args: object, **options: object) -> dsfit.Estimate:
+        found = original(*args, **options)
+        return dataclasses.replace(found, standard_error=0.5 * found.standard_error)
+
+    with mock.patch("dsfit.mis.estimate", optimistic):
+        outcome = run(subject, samples=20_000, heuristics=["balance"])
+    verdicts = {f.subject: v for f, v in judge(outcome.findings)}
+    assert verdicts.pop("claimed standard errors") == "fail"
+    assert "fail" not in verdicts.values()
