@@ -36,10 +36,10 @@ from dsfit.checks.furnace.sampling import (
     controls,
     default_proposals,
     furnace_case,
+    integrand_findings,
     judge_proposal,
     material_findings,
     proposal_findings,
-    quadrature_finding,
     total_only_findings,
 )
 from dsfit.checks.furnace.symmetry import symmetries
@@ -49,6 +49,7 @@ from dsfit.context import Context
 from dsfit.scene.integrand import Integrand
 from dsfit.scene.scattering import ConstantScattering
 
+_CONTROL_SAMPLES = 8192
 _PHI_R = 0.7  # of every viewer: matters to eccentric sections and to scattering that depends on azimuth
 
 
@@ -80,31 +81,39 @@ def run(
     furnace = Integrand(integrand.bsdf, scattering=integrand.scattering)
     partition = Partition.even(rings, wedges)
     make = default_proposals if proposals is None else proposals
-    cases, findings, good, bad = [], [], Record(), Record()
-    contexts = _contexts(furnace, inclinations_deg, n)
-    spoiled = sorted({0, len(contexts) - 1})  # where controls are run
-    for k, (label, context) in enumerate(contexts):
+    cases, findings, good = [], [], Record()
+    for k, (label, context) in enumerate(_contexts(furnace, inclinations_deg, n)):
         say(f"furnace: {label}")
         case = furnace_case(furnace, context, label, partition)
         cases.append(case)
-        findings.append(quadrature_finding(case))
+        findings += integrand_findings(case)
         found = make(furnace, context)
         for j, (name, proposal) in enumerate(found.items()):
             tested = judge_proposal(furnace, case, proposal, samples, _generator(seed, 0, k, j))
             good.rows[k, name] = tested
             findings += proposal_findings(name, case, tested)
         for j, name in enumerate([x for x in ("structured", "mixture") if x in found] or list(found)[:1]):
-            generator = _generator(seed, 1, k, j)
-            sup = good.rows[k, name].sup
+            generator, sup = _generator(seed, 1, k, j), good.rows[k, name].sup
             findings += material_findings(furnace, case, name, found[name], sup, samples // 4, generator)
-        if k in spoiled:
-            for j, (name, control) in enumerate(controls(found).items()):
-                bad.rows[k, name] = judge_proposal(furnace, case, control, samples, _generator(seed, 2, k, j))
-    names = dict.fromkeys(name for _, name in bad.rows)
-    findings += control_findings({name: [t for (_, x), t in bad.rows.items() if x == name] for name in names})
-    findings += total_only_findings(contexts[0][1], partition, samples, seed)
+    spoiled, bad = _controls(furnace, n, max(samples, _CONTROL_SAMPLES), partition, seed, say)
+    findings += control_findings(bad)
+    findings += total_only_findings(cases[0].context, partition, samples, seed)
     findings += _model_findings(furnace, seed, say)
-    return Outcome(findings, _arrays(cases, good, bad, partition))
+    return Outcome(findings, _arrays(cases, good, spoiled, bad, partition))
+
+
+def _controls(
+    furnace: Integrand, n: Sequence[float], samples: int, partition: Partition, seed: int, say: Say
+) -> tuple[list[Case], Record]:
+    """Samplers that must be rejected, where all of them can be, whatever inclinations were asked for."""
+    cases, bad = [], Record()
+    for k, (degrees, crossings) in enumerate(((0.0, n[0]), (89.0, n[-1]))):
+        ((label, context),) = _contexts(furnace, [degrees], [crossings])
+        say(f"furnace: negative controls, {label}")
+        cases.append(furnace_case(furnace, context, label, partition))
+        for j, (name, control) in enumerate(controls(default_proposals(furnace, context)).items()):
+            bad.rows[k, name] = judge_proposal(furnace, cases[-1], control, samples, _generator(seed, 2, k, j))
+    return cases, bad
 
 
 def _model_findings(furnace: Integrand, seed: int, say: Say) -> list[Finding]:
@@ -139,7 +148,9 @@ def _generator(seed: int, *path: int) -> torch.Generator:
     return torch.Generator().manual_seed(int(state[0] >> 2))
 
 
-def _arrays(cases: list[Case], good: Record, bad: Record, partition: Partition) -> dict[str, np.ndarray]:
+def _arrays(
+    cases: list[Case], good: Record, spoiled: list[Case], bad: Record, partition: Partition
+) -> dict[str, np.ndarray]:
     value = np.stack([case.nodes.integrate(lambda rule: rule.value)[0].sum(0).numpy() for case in cases])
     return {
         "labels": np.array([case.label for case in cases]),
@@ -149,7 +160,8 @@ def _arrays(cases: list[Case], good: Record, bad: Record, partition: Partition) 
         "ring_edges_deg": np.degrees(partition.theta.numpy()),
         "wedge_edges_deg": np.degrees(partition.phi.numpy()),
         **good.arrays("proposal", len(cases)),
-        **bad.arrays("control", len(cases)),
+        "control_labels": np.array([case.label for case in spoiled]),
+        **bad.arrays("control", len(spoiled)),
     }
 
 

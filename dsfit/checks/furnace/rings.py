@@ -214,7 +214,7 @@ def merge_cells(moments: Tensor, samples: int, least: float = EFFECTIVE) -> Tens
     rows = moments.tolist()
 
     def effective(i: float, s: float, t: float) -> float:
-        return 0.0 if min(i, s, t) <= 0 else samples * min(i * i / s, s**3 / t**2)
+        return 0.0 if min(i, s, t) <= 0 else samples * min(i * (i / s), s * (s / t) * (s / t))
 
     alone = [k for k, row in enumerate(rows) if effective(*row) >= least]
     group = torch.full((len(rows),), -1)

@@ -37,8 +37,8 @@ class SampleWeights:
 
     @property
     def faults(self) -> int:
-        """Number of samples with any fault but a gap."""
-        return self.bad_values + self.bad_weights + self.zero_density + self.invalid
+        """Number of samples with a fault of the sampler's: bad values of the integrand are not."""
+        return self.bad_weights + self.zero_density + self.invalid
 
 
 def sample_weights(draws: Draws) -> SampleWeights:

@@ -89,14 +89,14 @@ def rings(arrays: dict[str, np.ndarray], label: str) -> Figure:
     """Sampled over expected in every ring: right samplers above, wrong ones below."""
     right = _chosen(arrays, "proposal", _RIGHT)
     wrong = _chosen(arrays, "control", _WRONG)
-    case = _common_case(arrays)
+    at = _cases(arrays)
     columns = max(len(right), len(wrong), 1)
     figure = new_figure(0.8 + 2.5 * columns, 5.2)
     axes = figure.subplots(2, columns, squeeze=False, sharex=True, sharey="row")
     for row, prefix, names in ((axes[0], "proposal", right), (axes[1], "control", wrong)):
         color = COLORS[0] if prefix == "proposal" else COLORS[1]
         for axis, name in zip(row, names, strict=False):
-            _ratio_of_rings(axis, arrays, prefix, name, case, color)
+            _ratio_of_rings(axis, arrays, prefix, name, at[prefix], color)
         for axis in row[len(names) :]:
             axis.set_visible(False)
         row[0].set_ylim(0, _TOP)
@@ -104,7 +104,10 @@ def rings(arrays: dict[str, np.ndarray], label: str) -> Figure:
         axis.set_xlabel("θᵢ / °")
     axes[0, 0].set_ylabel("right: sampled / expected")
     axes[1, 0].set_ylabel("wrong: sampled / expected")
-    figure.suptitle(f"Ring light: {label}, {arrays['labels'][case]}", fontsize=10)
+    where = arrays["labels"][at["proposal"]]
+    if wrong and arrays["control_labels"][at["control"]] != where:
+        where = f"{where} (wrong: {arrays['control_labels'][at['control']]})"
+    figure.suptitle(f"Ring light: {label}, {where}", fontsize=10)
     return figure
 
 
@@ -114,12 +117,13 @@ def _chosen(arrays: dict[str, np.ndarray], prefix: str, wanted: tuple[str, ...])
     return [name for name in wanted if name in names] or names[:4]
 
 
-def _common_case(arrays: dict[str, np.ndarray]) -> int:
-    """The first case that controls were run in."""
-    if "control_ring_sampled" not in arrays:
-        return 0
-    run = np.isfinite(arrays["control_ring_sampled"]).any((1, 2))
-    return int(np.argmax(run))
+def _cases(arrays: dict[str, np.ndarray]) -> dict[str, int]:
+    """Which case is drawn: one that both proposals and controls were run in, if there is one."""
+    labels, controls = list(arrays["labels"]), list(arrays.get("control_labels", ()))
+    common = [label for label in controls if label in labels]
+    if not common:
+        return {"proposal": 0, "control": 0}
+    return {"proposal": labels.index(common[0]), "control": controls.index(common[0])}
 
 
 def _ratio_of_rings(axis: Axes, arrays: dict[str, np.ndarray], prefix: str, name: str, case: int, color: str) -> None:
