@@ -13,6 +13,7 @@ MODULES = (
     "inclination_functions",
     "azimuth_functions",
     "mass_functions",
+    "azimuth_mass_functions",
     "frame_functions",
     "weight_functions",
 )

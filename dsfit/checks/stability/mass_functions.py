@@ -28,16 +28,22 @@ from dsfit.quadrature import gauss_legendre
 
 HALF_PI = math.pi / 2
 _NODES = 16
-_STEPS = 2.0 ** torch.arange(-1, 26, dtype=torch.float64)
+_STEPS = 2.0 ** torch.arange(-1, 30, dtype=torch.float64)
 
 
-def integral(log_density: Callable[[Tensor], Tensor], edges: Tensor, dtype: torch.dtype) -> Tensor:
-    """int exp(log_density) over panels between `edges [K, E]`, `[K]`; `log_density` maps `[M, K]` to `[M, K]`."""
+def integral(
+    density: Callable[[Tensor], Tensor], edges: Tensor, dtype: torch.dtype, *, logarithm: bool = True
+) -> Tensor:
+    """Integral of a density, given as its log unless said otherwise, over panels between `edges [K, E]`, `[K]`;
+    `density` maps `[M, K]` to `[M, K]`.
+    """
     x, weight = gauss_legendre(_NODES)
     middle, half = (edges[:, 1:] + edges[:, :-1]) / 2, (edges[:, 1:] - edges[:, :-1]) / 2
     nodes = (middle.unsqueeze(-1) + half.unsqueeze(-1) * x).flatten(1).T.to(dtype)
     weights = (half.unsqueeze(-1) * weight).flatten(1).T
-    return (torch.exp(log_density(nodes)).to(torch.float64) * weights).sum(0).to(dtype)
+    value = density(nodes)
+    value = torch.exp(value) if logarithm else value
+    return (value.to(torch.float64) * weights).sum(0).to(dtype)
 
 
 def panels(low: float, high: float, *scales: tuple[Tensor, Tensor]) -> Tensor:
@@ -93,7 +99,8 @@ def _fixed(log_density: Callable[[Tensor], Tensor], low: float, high: float) -> 
     return compute
 
 
-def _one(*_: mp.mpf) -> mp.mpf:
+def one(*_: mp.mpf) -> mp.mpf:
+    """What every density integrates to."""
     return mp.mpf(1)
 
 
@@ -115,7 +122,7 @@ FUNCTIONS: list[Function] = [
         "mass.gaussian_lobe",
         ("alpha", "beta", "theta_r"),
         _lobe(TruncatedGaussianInclination),
-        _one,
+        one,
         lobe_laws(),
         gradient_scale=_per_width,
         limits=FEW_ULPS,
@@ -129,7 +136,7 @@ FUNCTIONS: list[Function] = [
         "mass.cauchy_lobe",
         ("alpha", "scale", "theta_r"),
         _lobe(CauchyInclination),
-        _one,
+        one,
         lobe_laws(),
         gradient_scale=_per_width,
         limits=FEW_ULPS,
@@ -141,7 +148,7 @@ FUNCTIONS: list[Function] = [
         "mass.split_lobe",
         ("mode", "above", "theta_r"),
         _lobe(lambda theta_r, mode, std: SplitGaussianInclination(theta_r, mode, 0.6 * std, std)),
-        _one,
+        one,
         lobe_laws(),
         gradient_scale=_per_width,
         limits=FEW_ULPS,
@@ -155,7 +162,7 @@ FUNCTIONS: list[Function] = [
         "mass.transmittance_cosine",
         ("theta_r",),
         _cosine_transmittance,
-        _one,
+        one,
         {
             "ordinary": [(x,) for x in deg(-60.0, 0.7, 35.0)],
             "grazing": [(x,) for x in (*deg(89.9, -89.999), HALF_PI, -HALF_PI)],
@@ -166,7 +173,7 @@ FUNCTIONS: list[Function] = [
         "mass.uniform_inclination",
         ("place",),
         _fixed(lambda theta: UniformInclinationLaw().log_prob(theta), -HALF_PI, HALF_PI),
-        _one,
+        one,
         _PLACES,
         gradients=(),
         limits=FEW_ULPS,
@@ -175,7 +182,7 @@ FUNCTIONS: list[Function] = [
         "mass.cosine_azimuth",
         ("place",),
         _fixed(lambda phi: CosineHalfLaw().log_prob(phi, phi), -math.pi, math.pi),
-        _one,
+        one,
         _PLACES,
         gradients=(),
         limits=FEW_ULPS,
@@ -184,7 +191,7 @@ FUNCTIONS: list[Function] = [
         "mass.cosine_azimuth_scattered",
         ("place",),
         _fixed(lambda phi: CosineHalfLaw().scattered_log_prob(phi, phi), -math.pi, math.pi),
-        _one,
+        one,
         _PLACES,
         gradients=(),
         limits=FEW_ULPS,
@@ -193,7 +200,7 @@ FUNCTIONS: list[Function] = [
         "mass.wrapped_azimuth",
         ("gamma",),
         _circle(WrappedGaussianLaw),
-        _one,
+        one,
         _WIDTHS,
         limits=FEW_ULPS,
         loose={
@@ -205,7 +212,7 @@ FUNCTIONS: list[Function] = [
         "mass.wrapped_azimuth_scattered",
         ("gamma",),
         _circle(WrappedGaussianLaw, True),
-        _one,
+        one,
         _WIDTHS,
         limits=FEW_ULPS,
     ),
@@ -213,7 +220,7 @@ FUNCTIONS: list[Function] = [
         "mass.truncated_azimuth",
         ("gamma",),
         _circle(TruncatedGaussianLaw),
-        _one,
+        one,
         _WIDTHS,
         limits=FEW_ULPS,
         loose={
@@ -225,7 +232,7 @@ FUNCTIONS: list[Function] = [
         "mass.truncated_azimuth_scattered",
         ("gamma",),
         _circle(TruncatedGaussianLaw, True),
-        _one,
+        one,
         _WIDTHS,
         limits=FEW_ULPS,
         loose={
