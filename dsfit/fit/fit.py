@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from dsfit.context import Context
-from dsfit.errors import InputError, check_choice
+from dsfit.errors import InputError, as_number, as_real, check_choice
 from dsfit.fit.objectives import LOG_FLOOR, Objective, Target, excess_residuals, objective_named
 from dsfit.fit.proposal_problem import Parameters, ProposalProblem
 from dsfit.fit.solvers import minimise, solver_named
@@ -121,8 +121,11 @@ def fit(
             copied; an integrand that is zero or not finite on the nodes; a start whose objective is not finite.
     """
     began = time.perf_counter()
-    if starts < 1:
+    if isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
         raise InputError("starts", starts, "integers >= 1")
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
+        raise InputError("seed", seed, "integers in [0, 2^63)")
+    jitter, max_seconds = as_number("jitter", jitter, 0.0), _seconds(max_seconds)
     methods = ("auto", "reverse", "forward", *(["own"] if hasattr(proposal, "log_prob_with_jacobian") else []))
     check_choice("jacobian", jacobian, methods)
     objective = objective_named(objective)
@@ -188,12 +191,16 @@ def copied(proposal: nn.Module) -> nn.Module:
         raise InputError("proposal", str(error), "a module that copy.deepcopy can copy") from error
 
 
+def _seconds(limit: Any) -> float:
+    return math.inf if isinstance(limit, float) and limit == math.inf else as_number("max_seconds", limit)
+
+
 def _node_fields(nodes: Any) -> tuple[Tensor, Tensor, Tensor]:
-    if isinstance(nodes, (tuple, list)):
-        omega, weight, value = nodes[:3]
-    else:
-        omega, weight, value = nodes.omega, nodes.weight, nodes.value
-    return omega, weight, value
+    names = ("omega", "weight", "value")
+    fields = nodes[:3] if isinstance(nodes, tuple | list) else [getattr(nodes, name, None) for name in names]
+    if len(fields) != 3 or not all(isinstance(x, Tensor) for x in fields):
+        raise InputError("nodes", nodes, "Nodes, or tensors omega [Q, 2], weight [Q], value [Q, C]")
+    return tuple(fields)
 
 
 def make_targets(
@@ -212,15 +219,17 @@ def make_targets(
         from dsfit.quality import quadrature_nodes
 
         each: Iterable[Any] = [quadrature_nodes(integrand, contexts[i], rtol=rtol) for i in range(count)]
-    elif context.batch_shape == () and not (isinstance(nodes, list) and not isinstance(nodes[0], Tensor)):
+    elif context.batch_shape == () and not (isinstance(nodes, list) and nodes and not isinstance(nodes[0], Tensor)):
         each = [nodes]
+    elif not isinstance(nodes, Sequence):
+        raise InputError("nodes", nodes, f"a list of one set for each of {count} contexts")
     else:
         each = list(nodes)
         if len(nodes) != count:
             raise InputError("nodes", f"{len(nodes)} sets", f"one set for each of {count} contexts")
     share = torch.full((count,), 1.0 / count, dtype=torch.float64)
     if weights is not None:
-        given = torch.as_tensor(weights, dtype=torch.float64).reshape(-1)
+        given = as_real("weights", weights, torch.float64).reshape(-1)
         if len(given) != count or not bool(((given > 0) & torch.isfinite(given)).all()):
             raise InputError("weights", given.tolist(), f"{count} positive numbers")
         share = given / given.sum()

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsfit.errors import InputError, check_choice, check_finite
-from dsfit.fit.problem import FunctionProblem, Problem
-from dsfit.fit.tracking import MOST_SCALED, SolverResult, Tracker, relative_gap
+from dsfit.errors import InputError, as_number, check_choice, check_finite
+from dsfit.fit.problem import FunctionProblem, Problem, gauss_newton_gap
+from dsfit.fit.tracking import MOST_SCALED, NUMERICAL, SolverResult, Tracker, relative_gap
 
 
 @dataclass(frozen=True)
@@ -106,11 +106,10 @@ def minimise(
     """
     if y0.ndim != 1 or not len(y0):
         raise InputError("y0", tuple(y0.shape), "a vector of at least one parameter")
-    if not tolerance > 0:
-        raise InputError("tolerance", tolerance, "numbers > 0")
+    tolerance = as_number("tolerance", tolerance, 0.0, open_low=True)
     if not reach > 0:
         raise InputError("reach", reach, "numbers > 0")
-    if max_steps is not None and max_steps < 0:
+    if max_steps is not None and (isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 0):
         raise InputError("max_steps", max_steps, "integers >= 0")
     start = check_finite("y0", y0.detach().to("cpu", torch.float64))
     problem = function if isinstance(function, Problem) else FunctionProblem(function, start)
@@ -130,14 +129,23 @@ def minimise(
 def _judged(
     result: SolverResult, tracker: Tracker, tolerance: float, absolute: float, reach: float = float("inf")
 ) -> SolverResult:
-    """Judge least-squares results of all solvers alike, by what a Gauss-Newton step from the best point promises.
+    """Judge the results of all solvers alike by what a Gauss-Newton step from the best point promises, where there is
+    such a model.
 
     Stopped for lack of progress is not converged if that is more than sqrt(tolerance); stopped otherwise is converged
     if it is less than the tolerance.
     """
-    if not tracker.problem.least_squares or len(result.y) > MOST_SCALED or result.value <= absolute:
+    problem = tracker.problem
+    if len(result.y) > MOST_SCALED or not (problem.least_squares or problem.gauss_newton):
         return result
-    if result.gap is None or not torch.equal(result.y, tracker.linearised_at):
+    if problem.least_squares and result.value <= absolute:
+        return result
+    if not problem.least_squares:
+        gap = _scalar_gap(problem, result, absolute, reach)
+        if gap is None:
+            return result
+        result = replace(result, gap=gap)
+    elif result.gap is None or not torch.equal(result.y, tracker.linearised_at):
         _, residuals, jacobian = tracker.linearise(result.y)
         result = replace(result, gap=relative_gap(residuals, jacobian, absolute, reach))
     assert result.gap is not None
@@ -148,3 +156,13 @@ def _judged(
         reason = f"{result.reason}; but a Gauss-Newton step from the best point promises only {result.gap:.1e}"
         return replace(result, converged=True, reason=reason)
     return result
+
+
+def _scalar_gap(problem: Problem, result: SolverResult, absolute: float, reach: float) -> float | None:
+    """As `relative_gap`, for a scalar with a Gauss-Newton model; None where that has no value."""
+    try:
+        residuals, jacobian = problem.linearise(result.y)
+    except NUMERICAL:
+        return None
+    tiny = torch.finfo(torch.float64).tiny
+    return gauss_newton_gap(residuals, jacobian, reach=reach) / max(abs(result.value), absolute, tiny)

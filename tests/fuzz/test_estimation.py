@@ -32,7 +32,7 @@ def generator() -> torch.Generator:
 counts = st.integers(-2, 9) | st.sampled_from([True, None, 1.5, math.nan, "3", 2**40, 10**30])
 
 
-@fuzz(200)
+@fuzz(120)
 @given(
     st.lists(counts, max_size=3) | counts,
     counts | st.sampled_from([21202]),
@@ -59,7 +59,7 @@ kinds = (
 logs = st.sampled_from([-math.inf, 0.0, -1e308, -750.0, 700.0, 1e308]) | st.floats(-50, 50)
 
 
-@fuzz(250)
+@fuzz(150)
 @given(kinds, st.integers(1, 3), st.integers(0, 4), st.data())
 def test_heuristics(kind: Any, strategies: int, points: int, data: st.DataObject) -> None:
     rule = attempt(heuristic, kind)
@@ -76,7 +76,7 @@ def test_heuristics(kind: Any, strategies: int, points: int, data: st.DataObject
         assert bool((total[~alive] == 0).all()) and bool(((total[alive] - 1).abs() < 1e-9).all())
 
 
-@fuzz(200)
+@fuzz(120)
 @given(
     st.sampled_from(["equal", "optimal", "proportional", "x"])
     | anything
@@ -136,7 +136,7 @@ proposals = st.sampled_from(
 ) | st.builds(Strange, numbers, numbers)
 
 
-@fuzz(150)
+@fuzz(100)
 @given(
     proposals,
     batches,
@@ -186,7 +186,7 @@ def test_estimate(
 values = st.sampled_from([0.0, 1.0, math.nan, math.inf, -1.0, 1e300, 1e-300]) | numbers
 
 
-@fuzz(100)
+@fuzz(50)
 @given(values, st.integers(0, 2), st.sampled_from([torch.float64, torch.float32]))
 def test_estimates_of_strange_integrands(value: float, channels: int, dtype: torch.dtype) -> None:
     def integrand(omega: Tensor, context: Context) -> Tensor:
@@ -200,7 +200,7 @@ def test_estimates_of_strange_integrands(value: float, channels: int, dtype: tor
             finite(found.value)
 
 
-@fuzz(60)
+@fuzz(10)
 @given(
     st.sampled_from([1e-2, 1e-3, 0.9]) | anything,
     batches,
@@ -260,7 +260,7 @@ nodesets = st.sampled_from(
 )
 
 
-@fuzz(60)
+@fuzz(40)
 @given(st.sampled_from([LOBE, MIX, LOBE, MIX, SPHERE, None, INTEGRAND]), nodesets, options)
 def test_fit(proposal: Any, nodes: Any, extra: dict[str, Any]) -> None:
     known = {"solver": "torch.lbfgs", "max_steps": 1, "rtol": 1e-2}
@@ -270,7 +270,7 @@ def test_fit(proposal: Any, nodes: Any, extra: dict[str, Any]) -> None:
         finite(*found.proposal.parameters())
 
 
-@fuzz(150)
+@fuzz(100)
 @given(tensors(numbers), tensors(unit), tensors(numbers), st.booleans(), mostly_fine | anything)
 def test_material(vector: Any, u: Any, other: Any, normalise: bool, n: Any) -> None:
     if normalise and vector.is_floating_point() and vector.ndim and vector.shape[-1] == 3:

@@ -58,7 +58,7 @@ PLACES = {
 angles = mostly_fine | anything
 
 
-@fuzz(150)
+@fuzz(60)
 @given(st.sampled_from(list(BSDFS)), angles, angles, angles, mostly_fine | anything, st.none() | unit | anything)
 def test_bsdf(name: str, theta_i: Any, theta_r: Any, phi: Any, n: Any, v: Any) -> None:
     bsdf = BSDFS[name]
@@ -107,7 +107,7 @@ named = st.sampled_from(["consistent", "printed"])
 FLOATS = st.sampled_from([torch.float64, torch.float32])
 
 
-@fuzz(100)
+@fuzz(60)
 @given(
     fibres,
     models,
@@ -129,7 +129,7 @@ def test_azimuths_of_extreme_fibres(
         assert bool(((value - mirrored).abs() <= 1e-12 * value.abs().amax()).all())
 
 
-@fuzz(3)
+@fuzz(2)
 @given(
     fibres,
     models,
@@ -200,7 +200,7 @@ def _all() -> dict[str, Proposal]:
 PROPOSALS = _all()
 
 
-@fuzz(250)
+@fuzz(200)
 @given(st.sampled_from(list(PROPOSALS)), contexts, tensors(numbers), tensors(unit))
 def test_proposal_at_any_tensor(name: str, one: Any, omega: Tensor, u: Tensor) -> None:
     distribution = PROPOSALS[name](make(one))
@@ -216,7 +216,7 @@ def test_proposal_at_any_tensor(name: str, one: Any, omega: Tensor, u: Tensor) -
         assert bool((direction[..., 0].abs() <= limit).all()) and bool((direction[..., 1].abs() <= 3.1416).all())
 
 
-@fuzz(250)
+@fuzz(150)
 @given(
     st.sampled_from(list(PROPOSALS)),
     contexts,
@@ -235,7 +235,7 @@ def test_every_uniform_gives_a_direction_with_its_density(name: str, one: Any, u
     finite(again)
 
 
-@fuzz(120)
+@fuzz(80)
 @given(
     st.sampled_from(list(PROPOSALS)),
     st.lists(contexts, min_size=1, max_size=3),
@@ -256,7 +256,7 @@ def test_a_batch_is_the_same_as_a_loop(name: str, batch: list[Any], u: list[floa
 ROUND = [name for name in PROPOSALS if not name.startswith("light")]
 
 
-@fuzz(120)
+@fuzz(80)
 @given(st.sampled_from(ROUND), contexts, _inclination(HALF_PI), st.floats(-3.1, 3.1))
 def test_densities_are_even_in_the_relative_azimuth(name: str, one: Any, theta: float, phi: float) -> None:
     context = make((one[0], 0.0, *one[2:]))
@@ -265,7 +265,7 @@ def test_densities_are_even_in_the_relative_azimuth(name: str, one: Any, theta: 
     assert a == b or abs(a - b) < 1e-6 * max(1.0, abs(a))
 
 
-@fuzz(100)
+@fuzz(50)
 @given(
     st.sampled_from(["consistent", "printed"]),
     contexts,
