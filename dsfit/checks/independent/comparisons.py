@@ -69,7 +69,7 @@ def region(weighted: Weighted, log_norm: float, limit: float) -> Region:
     """The part of the sphere where the proposal's weights are at most `limit` times int |F| domega."""
     bound = math.log(limit) + log_norm
     log_weight = np.where(weighted.log_weight <= bound, weighted.log_weight, -np.inf)
-    inside = weighted.other_log_weight <= bound
+    inside = (weighted.other_log_weight <= bound) & ~np.isneginf(weighted.other_log_weight)
     top = log_weight.max(initial=-np.inf)
     weight = np.exp(log_weight - top) if np.isfinite(top) else np.zeros_like(log_weight)
     return Region(weight, inside, float(inside.mean()), effective(log_weight))

@@ -11,11 +11,14 @@ import torch
 from dsfit.checks.finding import Finding
 from dsfit.checks.independent.chains import size_of, to_omega
 from dsfit.checks.independent.comparisons import Comparison
+from dsfit.checks.independent.diagnostics import Limits
 from dsfit.checks.independent.pointwise import assembly, deviations, exact_integrand
 from dsfit.checks.independent.verify import Judged, Verification, check
 from dsfit.checks.independent.welch import smallest_p
 from dsfit.checks.subject import Outcome, Say, Subject, silent
+from dsfit.context import Context
 from dsfit.frame import HALF_PI
+from dsfit.quality import reference
 
 SUITE = "independent"
 _SHARE = 0.1  # least share of |F| in the region that a proposal is judged on
@@ -48,8 +51,12 @@ def run(
     the BSDF against its exact mode and against `assembly` at places of the chains, and for every proposal its
     marginals, its means, and the integral by its bridge.
     """
+    known = reference(subject.integrand, subject.context, 1e-5)
+    if not float(known.norm) > 0:
+        return Outcome([Finding(SUITE, "chains", subject.label, unclear="int |F| is 0, or too small for float64")])
     found = check(
         subject,
+        known=known,
         ensembles=ensembles,
         walkers=walkers,
         steps=steps,
@@ -73,7 +80,7 @@ def findings_of(found: Verification, case: str, samples: int, shown: str | None 
             "chains",
             case,
             value=diagnostics.r_hat,
-            bound=None if diagnostics.reasons else diagnostics.r_hat,
+            bound=Limits().r_hat,
             unclear="; ".join(diagnostics.reasons) or None,
             detail=diagnostics.line,
             data={**diagnostics.to_dict(), "reasons": list(diagnostics.reasons), "shown": shown},
@@ -207,7 +214,7 @@ def _histograms(subject: Subject, found: Verification, shown: str | None) -> dic
     return arrays
 
 
-def _grid(subject: Subject, context: object) -> np.ndarray:
+def _grid(subject: Subject, context: Context) -> np.ndarray:
     """p* in cells of a midpoint rule, `[180, 180]`, that plots compare with; it may miss narrow lobes."""
     middle = (torch.arange(_BINS * _PER_BIN, dtype=torch.float64) + 0.5) / (_BINS * _PER_BIN) * 2 - 1
     theta, phi = torch.meshgrid(HALF_PI * middle, math.pi * middle, indexing="ij")

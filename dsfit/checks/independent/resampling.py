@@ -72,4 +72,12 @@ def draw(
         omega, log_p = law.sample_with_log_prob(u)
         elsewhere = law.log_prob(to_omega(place, context))
         own = torch.log(size(omega))
-    return Weighted(to_place(omega, context), own.numpy(), (own - log_p).numpy(), log_size - elsewhere.numpy())
+    return Weighted(
+        to_place(omega, context), own.numpy(), _ratio(own.numpy(), log_p.numpy()), _ratio(log_size, elsewhere.numpy())
+    )
+
+
+def _ratio(log_size: np.ndarray, log_p: np.ndarray) -> np.ndarray:
+    """log(|F| / p); where |F| = 0, it is -inf whatever p is, unless that is no number."""
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isneginf(log_size) & ~np.isnan(log_p), -np.inf, log_size - log_p)

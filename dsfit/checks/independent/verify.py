@@ -60,6 +60,7 @@ def check(
     subject: Subject,
     *,
     target: Size | None = None,
+    known: Reference | None = None,
     ensembles: int = 16,
     walkers: int = 32,
     steps: int = 300,
@@ -71,6 +72,7 @@ def check(
     """Ensembles on |F|, or on `target` (a second implementation of it, up to a factor), and all comparisons.
 
     Args:
+        known: the subject's reference, if it is known already.
         ensembles, walkers, steps, burn_in: see `run_ensembles`.
         samples: directions of each proposal.
     """
@@ -88,13 +90,14 @@ def check(
         burn_in=burn_in,
         seed=subject.seed,
     )
-    known = reference(subject.integrand, context, 1e-5)
+    known = reference(subject.integrand, context, 1e-5) if known is None else known
     nodes = quadrature_nodes(subject.integrand, context, 1e-3, count=10)
     shares = _shares(nodes, size, context)
     diagnostics = diagnose(chains, shares, limits)
     mass = (nodes.weight * nodes.norm).numpy()
     place = chains.thinned(_MOST)
-    log_size = np.log(own(to_omega(place.reshape(-1, 2), context)).numpy()).reshape(place.shape[:2])
+    with np.errstate(divide="ignore"):
+        log_size = np.log(own(to_omega(place.reshape(-1, 2), context)).numpy()).reshape(place.shape[:2])
     found, drawn = {}, {}
     for index, (name, proposal) in enumerate(subject.proposals.items()):
         say(f"comparing {name}")

@@ -37,7 +37,7 @@ class Sample:
         mean = weight @ values / total
         terms = (weight[:, None] * (values - mean) / total) ** 2
         variance = terms.sum(axis=0)
-        scatter = (terms**2).sum(axis=0) / np.maximum(variance, 1e-300) ** 2 - 1 / len(weight)
+        scatter = ((terms / np.maximum(variance, 1e-300)) ** 2).sum(axis=0) - 1 / len(weight)
         return Sample(mean, variance, 2 / np.maximum(scatter, 2 / len(weight)))
 
     @staticmethod
@@ -68,4 +68,4 @@ def smallest_p(p: np.ndarray) -> float:
     On the safe side if they depend on each other the way functions of the same samples do.
     """
     least = float(np.min(p))
-    return -np.expm1(len(p) * np.log1p(-least)) if least < 1 else 1.0
+    return float(-np.expm1(len(p) * np.log1p(-least))) if least < 1 else 1.0

@@ -16,6 +16,7 @@ from dsfit.experiment.rundir import RunDirectory
 
 _CONTEXTS = 4
 _KINDS = ("marginals", "means", "bridge")
+_COLORS = (COLORS[1], COLORS[2], COLORS[5])
 _FLOOR = 1e-12  # least p-value that is drawn apart
 
 
@@ -48,8 +49,8 @@ def context_figure(cell: dict[str, Any], arrays: dict[str, np.ndarray], level: f
     handles = [
         Line2D([], [], color=COLORS[0], label="chains"),
         Line2D([], [], color="black", linestyle="--", label="quadrature (midpoints)"),
-        Line2D([], [], color=COLORS[1], marker="o", linestyle="", markersize=4, label=f"{shown}, weighted"),
-        *(Line2D([], [], color=COLORS[k], marker=MARKERS[k], linestyle="", label=x) for k, x in enumerate(_KINDS)),
+        Line2D([], [], color=COLORS[3], marker="o", linestyle="", markersize=4, label=f"{shown}, weighted"),
+        *(Line2D([], [], color=_COLORS[k], marker=MARKERS[k], linestyle="", label=x) for k, x in enumerate(_KINDS)),
         Line2D([], [], color="#555555", marker="o", markerfacecolor="white", linestyle="", label="unclear"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
@@ -65,7 +66,7 @@ def _marginal(axis: Any, arrays: dict[str, np.ndarray], name: str) -> None:
     axis.stairs(arrays[f"{name}_chains"], edges, color=COLORS[0], linewidth=1.2)
     axis.plot(middle, arrays[f"{name}_quadrature"], color="black", linestyle="--", linewidth=1.0)
     if f"{name}_proposal" in arrays:
-        axis.plot(middle, arrays[f"{name}_proposal"], "o", color=COLORS[1], markersize=3)
+        axis.plot(middle, arrays[f"{name}_proposal"], "o", color=COLORS[3], markersize=3)
 
 
 def _p_values(axis: Any, findings: list[dict[str, Any]], rows: list[str], level: float) -> None:
@@ -76,8 +77,8 @@ def _p_values(axis: Any, findings: list[dict[str, Any]], rows: list[str], level:
             if found is None or found["p_value"] is None:
                 continue
             p = max(number(found["p_value"]), _FLOOR)
-            fill = "white" if found["unclear"] else COLORS[k]
-            axis.plot(p, row + 0.2 * (k - 1), MARKERS[k], color=COLORS[k], markerfacecolor=fill, markersize=4)
+            fill = "white" if found["unclear"] else _COLORS[k]
+            axis.plot(p, row + 0.2 * (k - 1), MARKERS[k], color=_COLORS[k], markerfacecolor=fill, markersize=4)
     if math.isfinite(level):
         axis.axvline(level, color="#555555", linestyle=":", linewidth=1.2)
     axis.set(xscale="log", xlabel="p-value", title="proposals against the chains", ylim=(len(rows) - 0.5, -0.5))
