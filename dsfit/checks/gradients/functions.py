@@ -33,14 +33,19 @@ _DIRECTIONS = ("theta_i", "theta_r", "phi", "n", "v")
 
 
 def directions(count: int, generator: torch.Generator, most: float = 1.35) -> dict[str, Tensor]:
-    """Random theta_i, theta_r (within +-most), phi, n in (0.5, 4) and v in (0.2, 0.8), each `[count]`."""
+    """Random theta_i, theta_r (within +-most), phi, n in (0.5, 4) and v in (0.2, 0.8), each `[count]`.
+
+    theta_diff is spread evenly over all that it can be: glints fade, and their offsets are cut off, at large ones only.
+    """
 
     def draw(low: float, high: float) -> Tensor:
         return low + (high - low) * torch.rand(count, generator=generator, dtype=torch.float64)
 
+    diff = most * ((torch.arange(count) + draw(0.0, 1.0)) * (2 / count) - 1)
+    half = draw(-1.0, 1.0) * (most - diff.abs())
     return {
-        "theta_i": draw(-most, most),
-        "theta_r": draw(-most, most),
+        "theta_i": half - diff,
+        "theta_r": half + diff,
         "phi": draw(-math.pi, math.pi),
         "n": draw(0.5, 4.0),
         "v": draw(0.2, 0.8),
@@ -97,7 +102,7 @@ def bsdf_in_fiber(bsdf: DualScattering, at: dict[str, Tensor]) -> Iterator[Deriv
         parts += [x.flatten(-2) for x in forward_backward_energies((bent,) * 3, fiber.sigma_a, convention.absorption)]
         found = averages_from_shares(fiber, convention, shares, 0.5 * shares, bsdf.d_b.to(torch.float64))
         parts += [getattr(found, name) for name in ("beta_f", "alpha_f", "delta_b", "sigma_b")]
-        shape = torch.broadcast_shapes(*(x.shape[:-1] for x in parts))
+        shape = torch.broadcast_shapes(fiber.batch_shape, *(x.shape[:-1] for x in parts))
         result = torch.cat([x.expand(*shape, -1) for x in parts], dim=-1)
         return result if batch else result.reshape(*at["phi"].shape, -1)
 

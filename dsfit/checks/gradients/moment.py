@@ -171,6 +171,8 @@ def moment_gradient(
 
 def parts_of(labels: Sequence[str], most: int = 40) -> list[str]:
     """Short names of parameters for tables and plots: without the words that all of them share."""
-    short = [x.replace(".raw", "").replace("components.", "").replace("longitudinal.", "θ ") for x in labels]
+    alone = not any("components.1." in x for x in labels)
+    short = [x.replace("components.0.", "") if alone else x.replace("components.", "") for x in labels]
+    short = [x.replace(".raw", "").replace("longitudinal.", "θ ") for x in short]
     short = [x.replace("azimuthal.", "φ ").replace("base.", "") for x in short]
     return [x[-most:] for x in short]
