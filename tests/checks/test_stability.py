@@ -213,3 +213,19 @@ def test_table_has_a_row_for_every_function() -> None:
     found = [f.to_dict() for name in ("mis.balance", "cosine_azimuth.sample") for f in run(name, seed=1).findings]
     lines = atlas_table(found).splitlines()
     assert len(lines) == 4 and lines[2].startswith("| `mis.balance` |") and "nan" not in lines[2]
+
+
+def test_maps_show_faults_and_limits() -> None:
+    from dsfit.experiment.plots.checks.stability import _Grid, figures
+
+    found = [f.to_dict() for name in ("mis.balance", "special.log_mills") for f in run(name, seed=1).findings]
+    found[0]["value"] = "inf"  # as JSON has it
+    result = {"title": "", "name": "atlas", "cells": [{"suite": "stability", "findings": found}]}
+    drawn = dict(figures(None, result))  # type: ignore[arg-type]
+    assert list(drawn) == ["stability", "stability-naive-value", "stability-naive-gradient"]
+    naive = _Grid(found, ["mis.balance"], "float64", "value", True)
+    mine = _Grid(found, ["mis.balance"], "float64", "value", False)
+    tail = list(CLASSES).index("tail")
+    assert naive.fault[0, tail] == "×" and naive.error[0, tail] == math.inf
+    assert mine.fault[0, tail] == "" and mine.error[0, tail] < 1e-14
+    assert mine.failed[0, 0] and mine.failed.sum() == 1
