@@ -108,6 +108,10 @@ class Objective(ABC):
         """The sum over nodes (dimension 0), `[Q, *batch] -> [*batch]`."""
         return self.residuals(log_p, weight, log_best).square().sum(0)
 
+    def slope(self, total: float) -> float:
+        """Derivative of `loss` by the sum of squared residuals, `total`: 1 where they are the same."""
+        return 1.0
+
     def factor(self, proposal: Any, target: Target) -> Tensor | float:
         """A positive factor per context that may depend on the proposal's parameters; differentiable."""
         return 1.0
@@ -155,13 +159,17 @@ class Excess(Objective):
 
 class LogExcess(Objective):
     """`log(1 + excess) = log(M / M*)`: its mean over contexts is a geometric mean of second moments, which a few bad
-    contexts do not dominate. For fits of one proposal to many contexts; not a sum of squares."""
+    contexts do not dominate. For fits of one proposal to many contexts; not a sum of squares, but a function of one, so
+    that a Gauss-Newton model can still judge where a fit ended."""
 
     name = "log_excess"
     least_squares = False
 
     def residuals(self, log_p: Tensor, weight: Tensor, log_best: Tensor) -> Tensor:
-        raise NotImplementedError
+        return excess_residuals(log_p, weight, log_best)
+
+    def slope(self, total: float) -> float:
+        return 1.0 / (1.0 + total)
 
     def loss(self, log_p: Tensor, weight: Tensor, log_best: Tensor) -> Tensor:
         return torch.log1p(excess_residuals(log_p, weight, log_best).square().sum(0))

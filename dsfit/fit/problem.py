@@ -115,11 +115,13 @@ class Problem(ABC):
     """A function to be minimised over a vector of `size` float64 parameters.
 
     `value` is `sum r^2` where `least_squares`, else the scalar itself. Results may be non-finite; solvers deal with
-    that.
+    that. A problem that is not least squares may yet have `gauss_newton`: `linearise` then gives residuals and a
+    Jacobian whose `2 J^T r` is the gradient and whose `2 J^T J` approximates the Hessian.
     """
 
     size: int
     least_squares: bool
+    gauss_newton: bool = False
 
     @abstractmethod
     def value(self, y: Tensor) -> float:
@@ -130,7 +132,7 @@ class Problem(ABC):
         """The value and its gradient [P]."""
 
     def linearise(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Compressed residuals [P + 1] and Jacobian [P + 1, P]; least-squares problems only."""
+        """Compressed residuals [P + 1] and Jacobian [P + 1, P]; only where `least_squares` or `gauss_newton`."""
         raise NotImplementedError
 
     def sampled_gradient(self, y: Tensor, count: int, generator: torch.Generator) -> tuple[float, Tensor]:

@@ -152,6 +152,7 @@ class ProposalProblem(Problem):
         self.targets = list(targets)
         self.parameters = Parameters(proposal)
         self.size, self.least_squares = self.parameters.size, objective.least_squares
+        self.gauss_newton = objective.least_squares or type(objective).slope is not Objective.slope
         self.blocks = _blocks(self.targets)
         self.log_density = _LogDensity(proposal)
         self.jacobian = jacobian
@@ -256,7 +257,8 @@ class ProposalProblem(Problem):
             factor = torch.as_tensor(factor, dtype=torch.float64, device=y.device)
             slope = torch.autograd.grad(factor, z, allow_unused=True)[0] if factor.requires_grad else None
         # d(sqrt(c) r) = sqrt(c) dr + r dc / (2 sqrt(c))
-        root = torch.sqrt(factor.detach() * target.share)
+        share = target.share * self.objective.slope(float(residuals.square().sum()))
+        root = torch.sqrt(factor.detach() * share)
         jacobian = root * jacobian
         if slope is not None:
             jacobian = jacobian + (root / (2 * factor.detach())) * residuals[:, None] * slope

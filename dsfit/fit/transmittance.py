@@ -36,6 +36,7 @@ CENTRES = (MEAN_BOUNDS[0] * _INSIDE, MEAN_BOUNDS[1] * _INSIDE)
 WIDTHS = (STD_BOUNDS[0] / _INSIDE, STD_BOUNDS[1] * _INSIDE)
 """Bounds of a width, radians."""
 _AT_BOUND = 1e-4  # share of the (for widths logarithmic) range within which a value counts as at its bound
+_REACH = 8.0  # longest step: far enough to arrive at a bound, which lies at infinity, in some ten steps
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ def _fit_gaussian(
         return torch.zeros_like(y[0]) if centred else from_raw(y[0], *CENTRES), from_raw(y[-1], *WIDTHS, log=True)
 
     found = minimise(
-        lambda y: residuals(*values(y)), torch.stack(start), solver, tolerance=1e-8, max_steps=200, reach=2.0
+        lambda y: residuals(*values(y)), torch.stack(start), solver, tolerance=1e-7, max_steps=200, reach=_REACH
     )
     centre, width = (float(value) for value in values(found.y))
     places = {"width": math.log(width / WIDTHS[0]) / math.log(WIDTHS[1] / WIDTHS[0])}

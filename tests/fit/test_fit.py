@@ -378,3 +378,35 @@ def test_fit_leaves_jax_in_its_default_precision():
 
     fit(Toy([0.1]), None, ONE, nodes=SINGLE, max_steps=2)
     assert not jax.config.jax_enable_x64 and jnp.zeros(2).dtype == jnp.float32
+
+
+def test_density_that_vanishes_where_the_integrand_does_not_is_no_fit():
+    narrow = Toy([-0.4, 0.5], defensive=0.0)
+    with torch.no_grad():
+        narrow.log_width.fill_(math.log(1e-3))
+    found = fit(narrow, None, ONE, solver="torch.adam", nodes=NODES, max_steps=2)
+    assert math.isinf(found.excess) and not found.converged and "density vanishes at" in found.result.reason
+    assert math.isfinite(fit(Toy([-0.4, 0.5]), None, ONE, solver="torch.adam", nodes=NODES, max_steps=2).excess)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_one_channel_is_never_more_than_grey(seed):
+    """Rounding once made `1 - grey` negative, and its root not a number."""
+    omega, weight = nodes()
+    value = torch.rand(len(weight), 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    target = Target.from_nodes(ONE, omega, weight, value)
+    assert 0 < target.grey <= 1
+
+
+def test_log_excess_is_judged_by_its_gauss_newton_model():
+    toy = Toy([-0.4, 0.5])
+    targets = make_targets(
+        None, BATCH, [nodes_of(truth(Toy([-0.4, 0.5])), BATCH.reshape(-1)[i], 20) for i in range(4)], 1e-3, None
+    )
+    problem = ProposalProblem(toy, targets, dsfit.fit.LogExcess())
+    y = problem.parameters.vector(toy)
+    residuals, jacobian = problem.linearise(y)
+    torch.testing.assert_close(2 * jacobian.T @ residuals, problem.gradient(y)[1], rtol=1e-9, atol=1e-12)
+    started = fit(toy, None, ONE, "log_excess", "torch.lbfgs", nodes=NODES, max_steps=1)
+    ended = fit(toy, None, ONE, "log_excess", "torch.lbfgs", nodes=NODES, max_steps=150, tolerance=1e-6)
+    assert started.result.gap > 0.1 > ended.result.gap and not started.converged

@@ -95,3 +95,28 @@ def test_scalar_problem_and_constant_function():
     assert problem.gradient(y + 1)[0] == 3.0
     constant = FunctionProblem(lambda y: torch.ones(3, dtype=torch.float64), y)
     assert constant.gradient(y) == (3.0, pytest.approx([0.0, 0.0]))
+
+
+@pytest.mark.parametrize("reach", [1e-3, 0.1, 1.0])
+def test_gap_within_reach_is_the_best_that_a_short_step_can_do(reach):
+    r, j = random_system(60, 4)
+    j = j * torch.tensor([1.0, 1e-2, 1e-4, 1e-6], dtype=torch.float64)  # the full step is long
+    promise = gauss_newton_gap(r, j, reach=reach)
+    assert 0 < promise < gauss_newton_gap(r, j)
+    # No step in the box does better, and the ball about it is used up.
+    g = torch.Generator().manual_seed(1)
+    steps = reach * (2 * torch.rand(20000, 4, generator=g, dtype=torch.float64) - 1)
+    toward = torch.linalg.lstsq(torch.cat([j, 1e-3 * torch.eye(4).double()]), torch.cat([-r, torch.zeros(4).double()]))
+    steps = torch.cat([steps, reach * toward.solution.reshape(1, -1) / toward.solution.abs().max()])
+    gain = r.square().sum() - (r + steps @ j.T).square().sum(-1)
+    assert float(gain.max()) <= promise * (1 + 1e-9)
+    along = torch.linalg.solve(j.T @ j + 1e-18 * torch.eye(4).double(), -j.T @ r)
+    assert along.abs().max() > reach
+
+
+def test_gap_within_reach_forgets_a_parameter_at_infinity():
+    r, j = random_system(60, 3)
+    dead = j.clone()
+    dead[:, 2] *= 1e-12  # say, the logit of a share of 1e-12
+    assert gauss_newton_gap(r, dead) == pytest.approx(gauss_newton_gap(r, j), rel=1e-9)
+    assert gauss_newton_gap(r, dead, reach=100.0) == pytest.approx(gauss_newton_gap(r, j[:, :2]), rel=1e-6)

@@ -235,3 +235,38 @@ def test_reach_limits_steps():
 def test_float32_start_is_solved_in_float64():
     result = minimise(rosenbrock, torch.tensor([-1.2, 1.0]), "optimistix.lm")
     assert result.y.dtype == torch.float64 and result.value < 1e-14
+
+
+def test_claims_of_a_solver_are_judged(monkeypatch):
+    """A solver that says that it converged after no step at all does not get away with it."""
+    from dsfit.fit import optimistix_solvers
+
+    def liar(name, tracker, **options):
+        return tracker.result(name, 0, True, "converged, honestly")
+
+    monkeypatch.setattr(optimistix_solvers, "least_squares", liar)
+    result = minimise(rosenbrock, vector(-1.2, 1.0), "optimistix.lm")
+    assert not result.converged and "yet a Gauss-Newton step" in result.reason
+    at_best = minimise(linear, BEST, "optimistix.lm")
+    assert at_best.converged
+
+
+def test_parameter_whose_bound_is_at_infinity_ends_converged():
+    """The best value of sigmoid(y0) is 0: reached at no finite y0, but within reach nothing is left to gain."""
+
+    def residuals(y):
+        return torch.stack([1 + torch.sigmoid(y[0]), y[1] - 2])
+
+    result = minimise(residuals, vector(0.0, 0.0), "optimistix.lm", reach=2.0, tolerance=1e-6)
+    assert result.converged and result.value == pytest.approx(1.0, rel=1e-5)
+    with pytest.raises(InputError, match="reach"):
+        minimise(residuals, vector(0.0, 0.0), "optimistix.lm", reach=0.0)
+
+
+def test_adam_on_a_plateau_away_from_the_best_point_does_not_claim_a_zero_gradient():
+    def residuals(y):  # flat at 5 beyond 1, and steep before: a first step of 0.6 leaps onto the plateau
+        return torch.where(y < 1, 1 + (y - 0.75) ** 2, 5.0 + 0 * y)
+
+    result = minimise(residuals, vector(0.5), "torch.adam", rate=0.6, max_steps=200)
+    assert result.value == pytest.approx(1.0, abs=1e-3), result
+    assert "gradient is zero" not in result.reason or float(result.y[0]) == pytest.approx(0.75, abs=1e-6)

@@ -9,7 +9,11 @@ import pytest
 import torch
 
 from dsfit.errors import InputError
-from dsfit.fit.transmittance import fit_transmittance
+from dsfit.fit.transmittance import CENTRES, WIDTHS, fit_transmittance
+from dsfit.frame import HALF_PI
+from dsfit.proposals import TransmittanceGaussian
+from dsfit.quadrature import panel_points
+from dsfit.special import truncated_normal_log_prob
 
 pytest.importorskip("jax")
 DEG = math.pi / 180
@@ -79,3 +83,44 @@ def test_real_fibres(sigma, table):
         assert row.converged and row.excess < 0.05 and row.excess < row.excess_centred < row.excess_cosine
         assert row.centre == pytest.approx(row.mean, abs=1.5 * DEG)
     assert [row.width for row in rows] == sorted((row.width for row in rows), reverse=True)
+
+
+def valley(theta):
+    """Least near the normal plane and rising towards both ends, as a_f of black hair."""
+    return 0.04 + 0.07 * torch.sin(theta - 0.1) ** 2 * torch.where(theta < 0, 1.0, 0.6)
+
+
+def test_attenuation_without_a_hill_stays_within_bounds():
+    rows = fit_transmittance(Fake(valley), [0.5, 2, 5, 20, 100])
+    for row in rows:
+        assert row.converged and all(math.isfinite(x) for x in (row.excess, row.excess_centred, row.centre, row.width))
+        assert CENTRES[0] <= row.centre <= CENTRES[1] and WIDTHS[0] <= row.width <= WIDTHS[1]
+        assert row.excess <= row.excess_centred * (1 + 1e-6) and row.excess < row.excess_cosine
+        # It can be handed to the law whose parameters these are.
+        TransmittanceGaussian(row.width, row.centre, variable="in")
+    # No Gaussian about 0 rises towards the ends: the widest is the best.
+    assert "width_centred" in rows[2].at_bounds and rows[2].width_centred == pytest.approx(WIDTHS[1], rel=1e-2)
+    assert "centre" in rows[1].at_bounds
+
+
+def test_fit_is_the_best_of_a_fine_grid():
+    (row,) = fit_transmittance(Fake(valley), [20])
+    edge = torch.tensor(HALF_PI, dtype=torch.float64)
+    theta, weight = (x.reshape(-1) for x in panel_points(torch.linspace(-HALF_PI, HALF_PI, 41).double(), 16))
+    best = valley(theta) ** 20
+    best = best / (weight * best).sum()
+    widths = torch.logspace(-2, 1, 200, dtype=torch.float64)
+    for centre in torch.linspace(*CENTRES, 60, dtype=torch.float64):
+        log_p = truncated_normal_log_prob(theta, centre, widths[:, None], -edge, edge)
+        excess = (weight * best**2 * torch.exp(-log_p)).sum(-1) - 1
+        assert row.excess <= float(excess.min()) + 1e-6
+
+
+@pytest.mark.slow
+def test_black_hair():
+    from dsfit.bsdf.dual_scattering import DualScattering
+    from dsfit.bsdf.fiber import Fiber
+
+    for row in fit_transmittance(DualScattering(Fiber.preset("black")), [1, 5, 20, 50]):
+        assert row.converged and row.excess < row.excess_centred < row.excess_cosine and row.excess < 3.5
+        assert row.at_bounds == ("centre", "width_centred")
