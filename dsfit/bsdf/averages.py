@@ -161,8 +161,9 @@ class LobeShares:
         kinks = self._kinks
         crossing = torch.cat([theta_in[:, None] + kinks, theta_in[:, None] - kinks, theta_in[:, None]], dim=1)
         # near grazing the factor 1/cos^2(theta_diff) is a boundary layer at the end of the interval: geometric panels
-        # there
-        grade = torch.tensor([0.25**k for k in range(1, 14)], dtype=theta_in.dtype) * HALF_PI
+        # there, of a ratio that 10 nodes resolve to 1e-13 wherever the layer is, down to a quarter of its thickness
+        grade = torch.tensor([0.4**k for k in range(1, 20)], dtype=theta_in.dtype) * HALF_PI
+        grade = torch.maximum(grade, (HALF_PI - theta_in.detach().abs())[:, None] / 8)
         layers = torch.cat([low[:, None] + grade, high[:, None] - grade], dim=1)
         breaks = torch.cat([low[:, None], high[:, None], around, crossing, layers], dim=1)
         near = torch.maximum(low, torch.minimum(high, around[:, 0]))[:, None]
@@ -187,20 +188,22 @@ def averages_from_shares(fiber: Fiber, convention: Convention, front: Tensor, ba
     """All averages from the lobes' forward and backward shares `[..., 3, C]`.
 
     a_f = sum_p a_f^p; alpha_f = sum_p a_f^p alpha_p / a_f; beta_f^2 = sum_p a_f^p beta_p^2 / a_f (or beta_f by
-    beta_p); likewise backward. R never vanishes, so the denominators are positive.
+    beta_p); likewise backward. Where all shares underflow, as for narrow lobes that leave the reachable inclinations,
+    shifts and widths are plain means.
     """
     a_f, a_b = front.sum(-2), back.sum(-2)
     tiny = torch.finfo(a_f.dtype).tiny
     alpha, beta = fiber.alpha.unsqueeze(-1), fiber.beta.unsqueeze(-1)
 
-    def mean(share: Tensor, total: Tensor, value: Tensor) -> Tensor:
-        return (share * value).sum(-2) / total.clamp_min(tiny)
+    def mean(share: Tensor, value: Tensor) -> Tensor:
+        weight = share + tiny**0.5
+        return (weight * value).sum(-2) / weight.sum(-2)
 
     if convention.mean_width == "variance":
-        beta_f, beta_b = (torch.sqrt(mean(s, t, beta**2).clamp_min(tiny)) for s, t in ((front, a_f), (back, a_b)))
+        beta_f, beta_b = (torch.sqrt(mean(share, beta**2)) for share in (front, back))
     else:
-        beta_f, beta_b = mean(front, a_f, beta), mean(back, a_b, beta)
-    alpha_f, alpha_b = mean(front, a_f, alpha), mean(back, a_b, alpha)
+        beta_f, beta_b = mean(front, beta), mean(back, beta)
+    alpha_f, alpha_b = mean(front, alpha), mean(back, alpha)
     if convention.limit_energy:
         total = (a_f + a_b).clamp_min(1.0)
         a_f, a_b = a_f / total, a_b / total

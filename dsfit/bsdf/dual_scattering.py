@@ -4,6 +4,7 @@ equations (4)-(12), (32), (37).
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from typing import Any
@@ -27,7 +28,7 @@ from dsfit.bsdf.scattered import simplified_windows
 from dsfit.bsdf.tables import AzimuthTable
 from dsfit.errors import InputError, as_real, check_broadcast, check_choice, check_finite, check_range, common_dtype
 from dsfit.frame import HALF_PI, cos_inclination, theta_diff, theta_half, wrap
-from dsfit.special import log_gauss
+from dsfit.special import is_differentiated, log_gauss
 
 
 class DualScattering:
@@ -107,15 +108,17 @@ class DualScattering:
             n: scattering fibres towards the light, real, >= 0.
             v: directly lit share in [0, 1]; left out, 1 where n = 0 and 0 elsewhere.
 
-        What is multiplied by an exact zero throughout the batch (a share of 0, d_b = 0) is not computed.
+        What is multiplied by an exact zero throughout the batch (a share of 0, d_b = 0) is not computed, unless a
+        derivative in that share is asked for.
         """
         theta_i, theta_r, phi, n, v = self._inputs(theta_i, theta_r, phi, n, v)
         total = theta_i.new_zeros(*torch.broadcast_shapes(theta_i.shape, self.fiber.batch_shape), self.channels)
         both = self.convention.share == "sum"
-        if both or bool((v != 0).any()):
+        whole = both or is_differentiated(v)  # a share of 0 still has a derivative
+        if whole or bool((v != 0).any()):
             share = 1.0 if both else v.unsqueeze(-1)
             total = total + share * self.direct(theta_i, theta_r, phi, n, phi_h=phi_h)
-        if both or bool((v != 1).any()):
+        if whole or bool((v != 1).any()):
             share = 1.0 if both else (1 - v).unsqueeze(-1)
             total = total + share * self.scatter(theta_i, theta_r, phi, n, phi_h=phi_h)
         return total * cos_inclination(theta_i).unsqueeze(-1)
@@ -127,7 +130,7 @@ class DualScattering:
         always.
         """
         value = self.single(theta_i, theta_r, phi, phi_h=phi_h)
-        if bool(self.d_b == 0):
+        if self._no_back:
             return value
         average = self.averages(self._average_angle(theta_i, theta_r))
         widened = self.convention.back_width == "always"
@@ -141,7 +144,7 @@ class DualScattering:
         average = self.averages(self._average_angle(theta_i, theta_r))
         variance_f = self._variance_f(average, n, theta_i)
         value = self.single_scattered(theta_i, theta_r, phi, variance_f, phi_h=phi_h)
-        if not bool(self.d_b == 0):
+        if not self._no_back:
             factor = math.pi if self.convention.back_factor == "pi" else 1.0
             back = self._back(theta_i, theta_r, phi, average, variance_f)
             value = value + factor * self.d_b.to(value.dtype) * back
@@ -198,17 +201,19 @@ class DualScattering:
             the treatment of the
         caustic only moves.
         """
-        front, back = self.lobe_shares(theta_in)
-        fiber = self._fiber(theta_in.dtype)
-        return averages_from_shares(fiber, self.convention, front, back, self.d_b.to(theta_in.dtype))
+        fiber, dtype = self._fiber(torch.float64), theta_in.dtype
+        front, back = self.lobe_shares(theta_in.to(torch.float64))  # 1 - a_f^2 cancels: round at the end
+        average = averages_from_shares(fiber, self.convention, front, back, self.d_b.to(torch.float64))
+        return Averages(*(getattr(average, field.name).to(dtype) for field in dataclasses.fields(Averages)))
 
     def lobe_shares(self, theta_in: Tensor) -> tuple[Tensor, Tensor]:
         """Forward and backward shares a_f^p, a_b^p of R, TT, TRT at theta_in, each `[..., 3, C]`; a_f and a_b are
         their sums.
         """
-        fiber = self._fiber(torch.float64)
+        fiber, dtype = self._fiber(torch.float64), theta_in.dtype
+        theta_in = theta_in.to(torch.float64)  # panels next to grazing are narrower than float32 can tell
         if not fiber.batch_shape:
-            return tuple(x.to(theta_in.dtype) for x in self._shares(theta_in))  # type: ignore[return-value]
+            return tuple(x.to(dtype) for x in self._shares(theta_in))  # type: ignore[return-value]
         shape = torch.broadcast_shapes(theta_in.shape, fiber.batch_shape)
         which = torch.arange(math.prod(fiber.batch_shape)).reshape(fiber.batch_shape).expand(shape)
         theta = theta_in.expand(shape)
@@ -217,8 +222,8 @@ class DualScattering:
             value = theta.new_zeros(*shape, 3, self.channels)
             for k, table in enumerate(self._shares_of_batch):
                 here = which == k
-                value = value.index_put((here,), table(theta[here])[half].to(theta.dtype))
-            parts.append(value)
+                value = value.index_put((here,), table(theta[here])[half])
+            parts.append(value.to(dtype))
         return parts[0], parts[1]
 
     def transmittance(self, theta_in: Tensor, n: Tensor) -> Tensor:
@@ -264,6 +269,11 @@ class DualScattering:
 
     def _average_angle(self, theta_i: Tensor, theta_r: Tensor) -> Tensor:
         return theta_i if self.convention.average_angle == "theta_in" else theta_diff(theta_i, theta_r)
+
+    @property
+    def _no_back(self) -> bool:
+        """Whether back scattering is multiplied by a zero that nobody asks a derivative of."""
+        return bool(self.d_b == 0) and not is_differentiated(self.d_b)
 
     @property
     def _printed_shapes(self) -> bool:
