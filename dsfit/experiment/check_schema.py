@@ -80,10 +80,12 @@ class StabilityOptions(Section):
 
 
 class StiffFitsOptions(Section):
-    """`[check.stiff_fits]`."""
+    """`[check.stiff_fits]`: problems and solvers by name ("controls" are the solvers that lie), and the seconds that a
+    solver is told it has; most are stopped by their steps before."""
 
     problems: Names = "all"
     solvers: Names = "all"
+    seconds: Annotated[float, Field(gt=0, le=3600)] = 20.0
 
 
 class ControlsOptions(Section):
