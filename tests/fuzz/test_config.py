@@ -222,7 +222,7 @@ def test_the_full_config_is_valid() -> None:
     assert found is not None and len(found.points) == 2
 
 
-@fuzz(150)
+@fuzz(90)
 @given(edits)
 def test_damaged_configs(changes: list[Any]) -> None:
     data = damaged(changes)

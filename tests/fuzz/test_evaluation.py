@@ -58,7 +58,7 @@ PLACES = {
 angles = mostly_fine | anything
 
 
-@fuzz(60)
+@fuzz(40)
 @given(st.sampled_from(list(BSDFS)), angles, angles, angles, mostly_fine | anything, st.none() | unit | anything)
 def test_bsdf(name: str, theta_i: Any, theta_r: Any, phi: Any, n: Any, v: Any) -> None:
     bsdf = BSDFS[name]

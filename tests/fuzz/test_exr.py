@@ -135,12 +135,12 @@ def hammer(folder: Path) -> None:
             assert image.pixels.dtype == torch.float32 and image.pixels.shape[2] == len(image.channels)
             count["read"] += 1
 
-    @fuzz(200)
+    @fuzz(150)
     @given(forged())
     def headers(data: bytes) -> None:
         read(data)
 
-    @fuzz(200)
+    @fuzz(150)
     @given(damage)
     def bytes_(how: tuple) -> None:
         number, edits, in_header, keep, tail = how
@@ -174,7 +174,7 @@ def test_any_file_is_an_image_or_an_input_error(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr[-3000:]
     errors, read = map(int, done.stdout.rsplit("counts ", 1)[1].split())
-    assert errors > 300 and read > 20
+    assert errors > 200 and read > 20
 
 
 def test_a_header_that_promises_a_huge_image_takes_no_memory(tmp_path: Path) -> None:

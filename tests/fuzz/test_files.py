@@ -121,7 +121,7 @@ def nodes(value: Any) -> Iterator[tuple[Any, Any]]:
         yield from nodes(value[key])
 
 
-@fuzz(250)
+@fuzz(150)
 @given(
     st.lists(
         st.tuples(st.integers(0, 10**6), st.sampled_from(["replace", "delete", "rename"]), values),
@@ -180,7 +180,7 @@ def test_edited_arrays_of_saved_proposals(saved: dict[str, np.ndarray], which: i
         works(path)
 
 
-@fuzz(150)
+@fuzz(70)
 @given(st.floats(0, 1), st.floats(0, 1), st.binary(max_size=5))
 def test_damaged_bytes_of_saved_proposals(
     tmp_path_factory: pytest.TempPathFactory, at: float, keep: float, noise: bytes
@@ -215,7 +215,7 @@ def show(path: Path, *options: str) -> int:
     return done.exit_code
 
 
-@fuzz(120)
+@fuzz(60)
 @given(
     st.lists(st.tuples(st.integers(0, 10**6), st.sampled_from(["replace", "delete"]), values), min_size=1, max_size=2)
 )

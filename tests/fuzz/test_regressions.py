@@ -18,7 +18,7 @@ from dsfit.random import uniforms
 
 def test_averages_at_grazing_inclination_in_float32() -> None:
     """Rounded to float32, pi/2 is too large, and the last panel of the tables has no width."""
-    bsdf = DualScattering(Fiber.preset("blond"), precision="table")
+    bsdf = DualScattering(Fiber.preset("blond"))
     for sign in (-1, 1):
         theta = (sign * torch.tensor(torch.pi / 2, dtype=torch.float32)).requires_grad_()
         averages = bsdf.averages(theta)
