@@ -135,12 +135,12 @@ def hammer(folder: Path) -> None:
             assert image.pixels.dtype == torch.float32 and image.pixels.shape[2] == len(image.channels)
             count["read"] += 1
 
-    @fuzz(150)
+    @fuzz(200)
     @given(forged())
     def headers(data: bytes) -> None:
         read(data)
 
-    @fuzz(150)
+    @fuzz(200)
     @given(damage)
     def bytes_(how: tuple) -> None:
         number, edits, in_header, keep, tail = how
