@@ -19,6 +19,7 @@ from dsfit.quadrature import PiecewiseChebyshev, graded_ends, merge_breaks, pane
 
 _ORIENTATION_NODES = 12
 _JUMPS = (math.sqrt(2.0), 2.0)  # eta' at which the way of TRT changes
+_EDGES = (1 / math.sin(math.pi / 8), 1 / math.sin(3 * math.pi / 8))  # eta' at which its edge crosses phi = +-pi/2
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ class LobeShares:
         if fiber.batch_shape:
             raise ValueError("LobeShares takes one fibre at a time")
         self.fiber, self.convention = fiber, convention
+        self._targets = _JUMPS if convention.split == "fraction" else _JUMPS + _EDGES
         self._kinks = self._jumps()
         inner = torch.tensor([0.4, 0.8, 1.2], dtype=self._kinks.dtype)
         breaks = merge_breaks(torch.cat([self._kinks, inner]), 0.0, HALF_PI, 1e-12)
@@ -77,7 +79,8 @@ class LobeShares:
         return value.select(-3, 0), value.select(-3, 1)
 
     def _jumps(self) -> Tensor:
-        """theta_diff where eta' = 2 or eta' = sqrt 2 for a principal orientation of the section.
+        """theta_diff where eta' = 2 or eta' = sqrt 2 (or, for a hard split, where the edge of TRT crosses +-pi/2) for a
+        principal orientation of the section.
 
         The TRT share has a jump in its second derivative there, or, for an eccentric section, its average over
         orientations begins to see one.
@@ -85,7 +88,7 @@ class LobeShares:
         points = []
         for angle in (0.0, math.pi / 2):
             eta = self.fiber.eta_trt(torch.tensor(angle, dtype=self.fiber.dtype)).detach()
-            for target in _JUMPS:
+            for target in self._targets:
                 cos2 = (eta**2 - 1) / (target * target - 1)
                 if 0.0 < float(cos2) < 1.0:
                     points.append(torch.acos(torch.sqrt(cos2)).reshape(()))
@@ -107,7 +110,7 @@ class LobeShares:
         low, high = (self.fiber.eta_trt(torch.tensor(a, dtype=theta_diff.dtype)).detach() for a in (math.pi / 2, 0.0))
         sin2, cos2 = torch.sin(theta_diff) ** 2, torch.cos(theta_diff) ** 2
         cuts = [torch.zeros_like(sin2), torch.full_like(sin2, math.pi / 2)]
-        for target in _JUMPS:
+        for target in self._targets:
             cosine = (2 * torch.sqrt(sin2 + target**2 * cos2) - high - low) / (high - low)
             cuts.append(torch.acos(cosine.clamp(-1.0, 1.0)) / 2)
         nodes, weight = panel_points(torch.sort(torch.stack(cuts, dim=-1), dim=-1).values, _ORIENTATION_NODES)
