@@ -11,7 +11,7 @@ import torch
 from dsfit.checks import stiff_fits
 from dsfit.checks.stiff_fits.cases import Limits, toy_case
 from dsfit.checks.stiff_fits.compare import compare, markdown
-from dsfit.checks.stiff_fits.examine import examine, gradient_of, shown_gain
+from dsfit.checks.stiff_fits.examine import FALSE_CLAIM, examine, gradient_of, shown_gain
 from dsfit.checks.stiff_fits.fits import FITS, gaussian_cases, gaussians, mass, nodes_of, one_context
 from dsfit.checks.stiff_fits.liars import LIARS, LIMITS, SOLVER, caught, honest_case, is_caught
 from dsfit.checks.stiff_fits.toys import TOYS
@@ -127,6 +127,28 @@ def test_run_and_comparison():
     assert [row.problems for row in rows] == [1, 1] and rows[0].solved == 1 and rows[0].faulty == 0
     assert all(row.solver in SOLVERS for row in rows)
     assert markdown(rows).count("\n") == 3
+
+
+@pytest.mark.parametrize("name", ["idle_parameter", "tiny_integrand"])
+def test_adam_does_not_claim_convergence_on_a_log_excess_that_a_step_still_lowers(name):
+    case = next(case for case in FITS[name]() if case.objective == "log_excess")
+    seen = examine(case, "torch.adam", Limits())
+    assert seen.faults == [] and (seen.shown <= FALSE_CLAIM or not seen.converged)
+
+
+def test_figure_marks_false_claims():
+    from dsfit.experiment.plots.checks.stiff_fits import figures
+
+    findings = [
+        f.to_dict() for f in stiff_fits.run("no_effect", seed=1, solvers=["torch.lbfgs", "torch.adam"]).findings
+    ]
+    findings[1]["value"] = 1.0
+    cells = [{"suite": "stiff_fits", "findings": findings}, {"suite": "other", "findings": []}]
+    ((name, figure),) = figures(None, {"cells": cells})
+    axes = figure.axes[0]
+    assert name == "stiff_fits" and [t.get_text() for t in axes.texts] == ["", "✗"]
+    assert [t.get_text() for t in axes.get_xticklabels()] == ["lbfgs", "adam"]
+    assert list(figures(None, {"cells": cells[1:]})) == []
 
 
 @pytest.mark.slow

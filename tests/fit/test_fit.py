@@ -389,7 +389,7 @@ def test_density_that_vanishes_where_the_integrand_does_not_is_no_fit():
     assert math.isfinite(fit(Toy([-0.4, 0.5]), None, ONE, solver="torch.adam", nodes=NODES, max_steps=2).excess)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [12, 23, 38])  # those of 0 to 40 where the ratio is rounded up
 def test_one_channel_is_never_more_than_grey(seed):
     """Rounding once made `1 - grey` negative, and its root not a number."""
     omega, weight = nodes()

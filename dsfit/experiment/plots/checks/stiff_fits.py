@@ -31,14 +31,15 @@ def figures(directory: RunDirectory, result: dict[str, Any]) -> Iterator[tuple[s
     for finding in findings:
         k, j = rows.index(finding["case"]), columns.index(finding["subject"])
         left[k, j] = _left(finding["data"])
-        mark = "✗" if number(finding["value"]) > 0 else "" if finding["data"]["converged"] else "·"
-        axes.text(j, k, mark, ha="center", va="center", fontsize=8, color="#d62728" if mark == "✗" else "black")
+        mark = "✗" if number(finding["value"]) > 0 else "" if finding["data"]["converged"] else "•"
+        color = "#d62728" if mark == "✗" else "white" if left[k, j] > -0.4 * _DECADES else "black"
+        axes.text(j, k, mark, ha="center", va="center", fontsize=8, color=color)
     image = axes.imshow(left, aspect="auto", cmap="viridis_r", vmin=-_DECADES, vmax=0)
     figure.colorbar(image, label="decades of the way from the start to the best value that are left")
     axes.set_xticks(range(len(columns)), [name.partition(".")[2] for name in columns], rotation=45, ha="right")
     axes.set_yticks(range(len(rows)), rows, fontsize=7)
     axes.grid(False)
-    axes.set_title("dot: stopped without claiming convergence;  cross: something said is false", fontsize=8)
+    axes.set_title("dot: did not claim convergence;  cross: something said is false;  white: not tried", fontsize=8)
     yield "stiff_fits", figure
 
 
