@@ -1,18 +1,13 @@
-"""Rows of the atlas: weights of multiple importance sampling, and the transmittance of many fibres."""
+"""Rows of the atlas: weights of multiple importance sampling, and densities of mixtures."""
 
 from __future__ import annotations
-
-from types import SimpleNamespace
 
 import mpmath as mp
 import torch
 from torch import Tensor
 
-from dsfit.bsdf.dual_scattering import DualScattering
-from dsfit.bsdf.fiber import Fiber
 from dsfit.checks.stability.function import Function, Point
 from dsfit.checks.stability.limits import FEW_ULPS, within
-from dsfit.checks.stability.points import product
 from dsfit.mis.heuristics import Balance, Heuristic, Power
 from dsfit.proposals.mixture import log_sum_exp
 
@@ -55,12 +50,6 @@ def _log_mixture(log_p: Tensor, log_q: Tensor) -> Tensor:
 def _log_mixture_twin(log_p: mp.mpf, log_q: mp.mpf) -> mp.mpf:
     top = max(log_p, log_q)
     return top + mp.log(mp.mpf(0.9) * mp.exp(log_p - top) + mp.mpf(0.1) * mp.exp(log_q - top))
-
-
-def _passed(a_f: Tensor, n: Tensor) -> Tensor:
-    """a_f^n by the BSDF, which gives it for averages that know a_f."""
-    bsdf = DualScattering(Fiber.preset("blond"), d_f=1.0)
-    return bsdf._transmittance(SimpleNamespace(a_f=a_f.unsqueeze(-1)), n).squeeze(-1)  # type: ignore[arg-type]
 
 
 def _vanishing(*_: float) -> float:
@@ -109,27 +98,6 @@ FUNCTIONS: list[Function] = [
         loose={
             "narrow": within(2e-15, 3e-12, 2e-6, 3e-2),
             "tail": within(2e-15, 9e-11, 2e-6, 3e-2),
-        },
-    ),
-    Function(
-        "bsdf.passed",
-        ("a_f", "n"),
-        _passed,
-        lambda a_f, n: a_f**n,
-        {
-            "ordinary": product([0.2, 0.5, 0.778], [1.0, 3.0, 12.0]),
-            "clear: a_f to 1 - 1e-12": product([0.999, 1 - 1e-7, 1 - 1e-12], [1.0, 30.0, 1e4], most=8),
-            "dark: a_f to 1e-30": product([0.01, 1e-6, 1e-30], [0.5, 1.0, 3.0]),
-            "deep n: 1e4, and not whole": [(0.778, 20.5), (0.778, 1e3), (0.95, 1e4), (0.5, 300.3), (0.036, 0.01)],
-            "small: n = 0 and next to it": product([0.036, 0.5, 0.778], [0.0, 1e-12, 1e-3]),
-        },
-        naive=lambda a_f, n: a_f**n,
-        density=True,
-        limits=FEW_ULPS,
-        loose={
-            "ordinary": within(7e-15, 1e-14, 3e-6, 1e-5),
-            "dark": within(4e-14, 4e-14, 8e-6, 1e-5),
-            "deep n": within(2e-13, 2e-13, 3e-6, 1e-5),
         },
     ),
 ]
