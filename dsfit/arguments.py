@@ -69,7 +69,8 @@ def check_uniforms(u: Tensor, dimension: int, batch: Sequence[int] = (), field: 
     if low > 0 and high < 1:
         return u
     eps = torch.finfo(u.dtype).eps
-    return u.clamp(eps / 4, 1 - eps / 2)
+    # Only these two: what the others become must not depend on the company they are drawn in.
+    return torch.where(u == 0, eps / 4, torch.where(u == 1, 1 - eps / 2, u))
 
 
 def _broadcast(a: Sequence[int], b: Sequence[int]) -> torch.Size | None:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dsfit import special
+from dsfit.arguments import check_uniforms
 from dsfit.checks.finding import Finding
 from dsfit.checks.stability import CLASSES, Function, atlas, findings, measure, parts, run
 from dsfit.checks.stability.function import class_of
@@ -207,6 +208,15 @@ def test_far_side_of_a_light_lobe_keeps_the_digits_of_u() -> None:
     light = VonMisesFisherLights([[0.0, 0.0]], 0.0)
     theta = light.proposal()(Context(0.0)).sample(torch.tensor([0.5, 0.75, 1e-30], dtype=torch.float64))
     assert torch.isfinite(theta).all()
+
+
+def test_an_exact_zero_among_uniforms_moves_no_other() -> None:
+    """It had raised all below eps / 4, and a light's sample from u = 1e-12 changed with the other uniforms."""
+    u = torch.tensor([[0.5, 1e-12, 0.25], [0.5, 0.7, 0.0], [0.5, 1.0, 0.3]], dtype=torch.float32)
+    moved = check_uniforms(u, 3)
+    eps = torch.finfo(torch.float32).eps
+    assert moved[0].tolist() == u[0].tolist()
+    assert moved[1, 2] == eps / 4 and moved[2, 1] == 1 - eps / 2 and moved.dtype == torch.float32
 
 
 def test_table_has_a_row_for_every_function() -> None:
