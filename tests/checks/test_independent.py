@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import math
 import types
 from dataclasses import replace
@@ -215,6 +216,7 @@ def test_a_short_run_says_so() -> None:
         width = np.diff(outcome.arrays[f"{name}_edges_deg"])
         for kind in ("chains", "quadrature", "proposal"):
             assert (outcome.arrays[f"{name}_{kind}"] * width).sum() == pytest.approx(1)
+    assert json.loads(json.dumps([f.to_dict() for f in outcome.findings]))[0]["data"]["shown"] == "uniform"
     result = {
         "cells": [
             {"index": 0, "suite": "independent", "label": "a", "findings": [f.to_dict() for f in outcome.findings]}

@@ -8,9 +8,9 @@ Random walks know neither the proposals nor the quadrature: only |F|. Which wron
   and means normalise the weights, and importance sampling is wrong by the same factor;
 - a wrong quadrature: means of the chains against means of the quadrature, and every bridge;
 - a wrong |F|: nothing of the above, where chains, weights and quadrature share it. Chains may therefore be run on a
-  second implementation (`target` of `check`); and at places of the chains the subject's BSDF is compared with its
-  exact mode (tables) and with `assembly`, which puts it together once more: these see an error of 1e-3 anywhere where
-  |F| is not small, without any statistics;
+  second implementation (`target` of `check`); and at places of the chains the subject's BSDF is compared, without any
+  statistics, with its exact mode (tables may be 2e-3 off in the mean) and with `assembly`, which puts it together once
+  more (1e-9 anywhere);
 - a wrong |F| that all of these share (a wrong N_p, wrong averages): not at all. tests/oracle is there for that.
 
 Outside of the region where a proposal's weights are bounded (`Region`) nothing is said about it: a lobe is judged where

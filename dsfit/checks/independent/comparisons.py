@@ -23,11 +23,9 @@ class Comparison:
     Attributes:
         names: of the numbers.
         p: p-value of each, by Welch's t.
-        p_value: the smallest, corrected for taking it.
         z: differences in standard errors.
-        relative_error: largest standard error in units of the spread of what is averaged (for the bridge: of the
-            integral), which bounds what the comparison can see.
-        worst: name of the number that differs most.
+        relative_error: largest standard error in units of the spread of what is averaged, which bounds what the
+            comparison can see.
     """
 
     names: tuple[str, ...]
@@ -37,10 +35,12 @@ class Comparison:
 
     @property
     def p_value(self) -> float:
+        """The smallest p-value, corrected for having taken it."""
         return smallest_p(self.p)
 
     @property
     def worst(self) -> str:
+        """Name of the number that differs most."""
         return self.names[int(np.argmin(self.p))]
 
 
