@@ -227,7 +227,7 @@ def along_random_directions(
 ) -> Iterator[DerivativeCheck]:
     """Derivatives along normal random directions in all of `names` together."""
     generator = torch.Generator().manual_seed(seed)
-    at_once = all(batches(function, values, name) for name in names)
+    at_once: bool | None = None
     for k in range(ways):
         way = {n: torch.randn(values[n].shape, generator=generator, dtype=torch.float64) for n in names}
 
@@ -237,6 +237,7 @@ def along_random_directions(
             return function({**values, **{name: values[name] + shift[name] for name in names}})
 
         at = {_WAY: torch.zeros((), dtype=torch.float64)}
+        at_once = batches(moved, at, _WAY) if at_once is None else at_once
         check = check_derivative(moved, at, _WAY, step=0.5 * step, at_once=at_once)
         yield replace(check, name=f"all, direction {k + 1} of {ways}")
 

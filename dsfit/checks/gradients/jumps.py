@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dsfit.frame import HALF_PI
 
-_ROWS, _POINTS, _CANDIDATES, _HALVINGS = 17, 720, 6, 44
+_ROWS, _POINTS, _CANDIDATES, _HALVINGS = 17, 720, 6, 32
 SEEN = 1e-3
 """Smallest jump, relative to the larger of both sides, that counts as one."""
 

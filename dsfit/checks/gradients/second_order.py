@@ -27,7 +27,7 @@ class SecondOrder:
 
 
 def second_derivatives(
-    function: Function, values: Values, name: str, *, step: float = 0.1, seed: int = 0
+    function: Function, values: Values, name: str, *, step: float = 0.1, seed: int = 0, levels: int = 7
 ) -> SecondOrder:
     """Differentiate twice `sum_i w_i f_i`, with random weights w, in the input `name`.
 
@@ -49,7 +49,7 @@ def second_derivatives(
             (slope,) = torch.autograd.grad(total, leaf, create_graph=True, allow_unused=True)
         return torch.zeros_like(leaf) if slope is None else slope
 
-    check = check_derivative(gradient, fixed, name, step=step, forward=False)
+    check = check_derivative(gradient, fixed, name, step=step, levels=levels, forward=False)
     status: Status = "agrees"
     if check.worst > 1:
         small = float(check.reverse.abs().max()) <= 1e-9 * float(check.numeric.abs().nan_to_num().max())
