@@ -16,6 +16,7 @@ MODULES = (
     "azimuth_mass_functions",
     "frame_functions",
     "weight_functions",
+    "bsdf",
 )
 """Modules with a list `FUNCTIONS`, in the order of the map's rows."""
 
