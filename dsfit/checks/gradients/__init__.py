@@ -48,7 +48,7 @@ def run(
         moments: names of the chapter's proposals whose second moment is differentiated, or "all"; others always are.
         through_fit: whether to differentiate through a fit.
         averages: whether to differentiate the averages of dual scattering in the fibre as well, which makes them anew
-            some fifty times: minutes.
+            some eighty times: many minutes.
     """
     outcome = Outcome()
     outcome.findings += derivative_findings(subject, points, averages, say)
