@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 from torch import Tensor
 
 import dsfit
@@ -291,9 +292,9 @@ def test_assembly(n: float, v: float) -> None:
 
 @pytest.mark.slow
 def test_false_alarms_on_hair() -> None:
-    """12 runs over presets, viewers and seeds: all clear, nothing fails, and small p-values are as rare as they
-    should be."""
-    p_values, failures, unclear = [], [], 0
+    """12 runs over presets, viewers and seeds: chains are clear, as few families as their level allows have a failure,
+    and small p-values are as rare as they should be."""
+    p_values, runs, failures, unclear = [], 0, 0, 0
     for preset in ("blond", "black"):
         made = dsfit.DualScattering(dsfit.Fiber.preset(preset), precision="table")
         for theta_r, n in ((0.8, 3.0), (-0.4, 1.0)):
@@ -302,7 +303,8 @@ def test_false_alarms_on_hair() -> None:
                 found = independent.check(case, samples=SAMPLES)
                 unclear += bool(found.diagnostics.reasons)
                 verdicts = judge(findings_of(found, f"{preset} {theta_r} {seed}", SAMPLES))
-                failures += [(f.case, f.subject) for f, verdict in verdicts if verdict == "fail"]
+                runs += 1
+                failures += any(verdict == "fail" for _, verdict in verdicts)
                 p_values += [f.p_value for f, verdict in verdicts if verdict != "unclear" and f.p_value is not None]
-    assert not failures and unclear <= 1
+    assert failures <= stats.binom.isf(1e-3, runs, 0.01) and unclear <= 1
     assert np.mean(np.array(p_values) < 0.05) < 0.1 and min(p_values) > 1e-5
