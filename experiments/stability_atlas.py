@@ -1,6 +1,6 @@
 """The table of the stability atlas: worst errors of every function against 50-digit arithmetic.
 
-    python experiments/stability_atlas.py                       (measures them: two minutes)
+    python experiments/stability_atlas.py                       (measures them: three minutes)
     dsfit check configs/stability.toml
     python experiments/stability_atlas.py runs/stability-ID     (reads a finished run)
 """
