@@ -108,7 +108,9 @@ class CheckConfig(Section):
     `module:name` that take (integrand, context) and return a proposal.
     """
 
-    suites: Annotated[list[SuiteName], Field(min_length=1)] = ["chi_square", "unbiased", "independent", "furnace", "gradients"]
+    suites: Annotated[list[SuiteName], Field(min_length=1)] = [
+        "chi_square", "unbiased", "independent", "furnace", "gradients",
+    ]  # fmt: skip
     level: Level = 0.01
     proposals: Names = "all"
     saved: list[str] = []

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from dsfit.context import Context
 from dsfit.errors import InputError, as_number, as_real, check_choice

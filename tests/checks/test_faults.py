@@ -1,4 +1,4 @@
-"""Every planted fault is caught by its check, every check is content without it, and the library is itself again after."""
+"""Planted faults are caught by their checks, which are content without them, and the library is itself again after."""
 
 from __future__ import annotations
 

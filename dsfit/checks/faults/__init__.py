@@ -18,6 +18,7 @@ from dsfit.checks.subject import Outcome, Say, silent
 from dsfit.errors import InputError
 
 SUITE = "faults"
+_LEVEL = 1e-6  # of the checks: a catch has to be beyond doubt, and nothing may be caught by chance
 
 
 def parts(faults: Any = "all") -> list[str]:
@@ -38,7 +39,7 @@ def run(part: str, *, seed: int, say: Say = silent, faults: Any = "all") -> Outc
     """One fault: the check without it, which has to pass, and with it, which has to fail."""
     fault = FAULTS[part]
     say("without the fault")
-    clean = judge(fault.look(seed))
+    clean = judge(fault.look(seed), _LEVEL)
     say("with it")
     with planted(fault.patches):
         spoiled = _guarded(fault, seed)
@@ -60,7 +61,7 @@ def run(part: str, *, seed: int, say: Say = silent, faults: Any = "all") -> Outc
 def _guarded(fault: Fault, seed: int) -> list[tuple[Finding, str]]:
     """An exception is a catch as well: the library has refused to go on."""
     try:
-        return list(judge(fault.look(seed)))
+        return list(judge(fault.look(seed), _LEVEL))
     except Exception as error:
         message = f"{type(error).__name__}: {error}"[:200]
         return [(Finding(fault.suite, "refused", "", value=1.0, bound=0.0, detail=message), "fail")]

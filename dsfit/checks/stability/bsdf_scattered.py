@@ -197,7 +197,7 @@ FUNCTIONS: list[Function] = [
     Function(
         name="bsdf.A_b",
         arguments=("a_f", "a_b"),
-        compute=backscatter_albedo,
+        compute=lambda a_f, a_b: backscatter_albedo(a_f, a_b),  # looked up when called: faults are planted there
         exact=averages.back_albedo,
         regimes={
             "ordinary": product((0.5, 0.77), (0.05, 0.2)),
