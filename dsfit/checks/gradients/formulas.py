@@ -42,7 +42,7 @@ def _log_window_twin(a: Any, b: Any) -> Any:
 def _icdf_twin(mean: Any, u: Any, std: Any, low: Any, high: Any) -> Any:
     a, b = mpmath.ncdf((low - mean) / std), mpmath.ncdf((high - mean) / std)
     target = a + u * (b - a)
-    return mpmath.findroot(lambda x: mpmath.ncdf((x - mean) / std) - target, low + u * (high - low), tol=1e-50)
+    return mean + std * mpmath.sqrt(2) * mpmath.erfinv(2 * target - 1)
 
 
 def _wrapped_twin(x: Any, std: Any) -> Any:
