@@ -1,4 +1,4 @@
-"""The table of the stability atlas: worst errors of every function against 50-digit arithmetic.
+"""The tables of the stability atlas: worst errors against 50-digit arithmetic, by regime and by function.
 
     python experiments/stability_atlas.py                       (measures them: three minutes)
     dsfit check configs/stability.toml
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dsfit.checks.stability import parts, run
-from dsfit.checks.stability.table import atlas_table
+from dsfit.checks.stability.table import atlas_table, class_table
 
 
 def measured() -> list[dict[str, Any]]:
@@ -29,7 +29,9 @@ def recorded(folder: Path) -> list[dict[str, Any]]:
 
 def main(arguments: list[str]) -> None:
     """Command line; see the module text."""
-    print(atlas_table(recorded(Path(arguments[0])) if arguments else measured()), end="")
+    findings = recorded(Path(arguments[0])) if arguments else measured()
+    print(class_table(findings))
+    print(atlas_table(findings), end="")
 
 
 if __name__ == "__main__":

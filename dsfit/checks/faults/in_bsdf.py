@@ -83,7 +83,7 @@ BSDF_FAULTS = (
         "stability", looks.digits("bsdf.fresnel"),
     ),
     Fault(
-        "snell-spread", f"{BSDF}.snell", "the ray density of TRT without its factor 2 per internal segment",
+        "snell-spread", f"{BSDF}.snell", "the slope of the azimuth at which TRT leaves, halved",
         (Patch(f"{BSDF}.snell:exit_trt_slope", scaled(0.5)),), "stability", looks.digits("bsdf.N_TRT"),
     ),
     Fault(
@@ -92,7 +92,7 @@ BSDF_FAULTS = (
         looks.digits("bsdf.N_TT", "bsdf.N_TRT"),
     ),
     Fault(
-        "glint-per-root", f"{BSDF}.glint", "the glint added once per root",
+        "glint-per-root", f"{BSDF}.glint", "the glint added twice, once per root",
         (Patch(f"{BSDF}.glint:Glint.of", _glint_twice),), "stability", looks.digits("bsdf.N_TRT"),
     ),
     Fault(
@@ -122,7 +122,7 @@ BSDF_FAULTS = (
         "furnace", looks.known_furnace(),
     ),
     Fault(
-        "tilt-sign", f"{BSDF}.dual_scattering", "theta_half for theta_diff in the azimuth of single scattering",
+        "tilt-sign", f"{BSDF}.dual_scattering", "theta_diff 0.1 rad off in the azimuth of single scattering",
         (Patch(f"{BSDF}.dual_scattering:DualScattering.azimuthal",
                lambda original: lambda self, diff, phi, **k: original(self, diff + 0.1, phi, **k)),),
         "furnace", looks.symmetry(),

@@ -116,7 +116,7 @@ ESTIMATOR_FAULTS = (
         looks.estimating(_lobes, heuristics=("power",)),
     ),
     Fault(
-        "mis-combine", "dsfit.mis.estimators", "z without the share of its strategy in the one-sample model",
+        "mis-combine", "dsfit.mis.estimators", "contributions of samples two per cent too large",
         (Patch("dsfit.mis.estimators:contribution", changed(lambda z, *_: z * 1.02)),), "unbiased",
         looks.estimating(_lobes),
     ),
@@ -131,7 +131,7 @@ ESTIMATOR_FAULTS = (
         looks.energy(),
     ),
     Fault(
-        "excess-norm", "dsfit.quality", "the excess with the integral of F for that of |F|",
+        "excess-norm", "dsfit.quality", "an excess that is 0.5 too large",
         (Patch("dsfit.quality:_excess_one", changed(lambda r, *_: (r[0] + 0.5, *r[1:]))),), "unbiased", _moment,
     ),
     Fault(
@@ -139,7 +139,7 @@ ESTIMATOR_FAULTS = (
         (Patch("dsfit.fit.bridge:register", _turned),), "gradients", _fit,
     ),
     Fault(
-        "objective-half", "dsfit.fit.objectives", "residuals of the excess without the root of p below",
+        "objective-half", "dsfit.fit.objectives", "residuals of the excess over p^(1/4) for p^(1/2)",
         (Patch("dsfit.fit.objectives:excess_residuals", changed(lambda r, log_p, *_: r * torch.exp(0.25 * log_p))),),
         "gradients", _fit,
     ),

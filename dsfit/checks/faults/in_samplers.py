@@ -147,7 +147,7 @@ SAMPLER_FAULTS = (
         "chi_square", looks.sampling(_structured),
     ),
     Fault(
-        "light-width", f"{SCENE}.lobes", "lobes of light drawn with a concentration 3 % too low",
+        "light-width", f"{SCENE}.lobes", "the normaliser of a lobe of light 3 % too large",
         (Patch(f"{SCENE}.lobes:log_normaliser", changed(lambda log, kappa: log + 0.03)),), "chi_square",
         looks.sampling(_lobes_light),
     ),

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+from dsfit.checks.stability.function import CLASSES
+
 _HEAD = ("function", "float64", "its gradient", "float32", "its gradient", "naive, float64", "naive, float32", "worst")
 _COLUMNS = (("float64", "value"), ("float64", "gradient"), ("float32", "value"), ("float32", "gradient"))
 
@@ -25,6 +27,27 @@ def atlas_table(findings: Iterable[dict[str, Any]]) -> str:
         cells += [_number(_worst_naive(found, dtype)) for dtype in ("float64", "float32")]
         lines.append("| " + " | ".join([f"`{name}`", *cells, _where(found)]) + " |")
     return "\n".join([*lines, ""])
+
+
+def class_table(findings: Iterable[dict[str, Any]]) -> str:
+    """Markdown, one row per class of regimes: the worst errors of all functions there, and whose they are."""
+    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in CLASSES}
+    for finding in findings:
+        if finding["suite"] == "stability":
+            rows[finding["data"]["class"]].append(finding)
+    head = ("regime", "float64", "its gradient", "float32", "its gradient")
+    lines = ["| " + " | ".join(head) + " |", "|---|" + "---|" * (len(head) - 1)]
+    for name, found in rows.items():
+        cells = [_worst_of_all(_of(found, *column)) for column in _COLUMNS]
+        lines.append("| " + " | ".join([f"{name}: {CLASSES[name]}", *cells]) + " |")
+    return "\n".join([*lines, ""])
+
+
+def _worst_of_all(found: list[dict[str, Any]]) -> str:
+    if not found:
+        return ""
+    worst = max(found, key=lambda f: float(f["value"]))
+    return f"{_number(float(worst['value']))} `{worst['subject']}`"
 
 
 def _of(found: list[dict[str, Any]], dtype: str, quantity: str) -> list[dict[str, Any]]:
