@@ -105,6 +105,8 @@ def show(
     ] = False,
 ) -> None:
     """Print a finished run's table again, and draw its figures again if asked to."""
+    from rich.errors import ConsoleError
+
     from dsfit.errors import InputError
     from dsfit.experiment.rundir import RunDirectory
 
@@ -113,7 +115,7 @@ def show(
         _report(directory, directory.result(), draw=plots)
     except OSError as error:
         _fail(f"{rundir}: {error}", 1)
-    except (InputError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+    except (InputError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError, ConsoleError) as error:
         text = (
             str(error)
             if isinstance(error, InputError)

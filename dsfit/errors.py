@@ -111,9 +111,17 @@ def check_range(
     bad = (data <= low) if open_low else (data < low)
     bad = bad | ((data >= high) if open_high else (data > high))
     if bool(bad.any()):
-        interval = f"{'(' if open_low else '['}{low:g}, {high:g}{')' if open_high else ']'}"
-        raise InputError(field, _first_bad(value, bad), f"numbers in {interval}")
+        raise InputError(field, _first_bad(value, bad), _interval(low, high, open_low, open_high))
     return value
+
+
+def _interval(low: float, high: float, open_low: bool, open_high: bool) -> str:
+    """The numbers of a range, in words."""
+    if high == float("inf"):
+        return f"numbers {'>' if open_low else '>='} {low:g}"
+    if low == -float("inf"):
+        return f"numbers {'<' if open_high else '<='} {high:g}"
+    return f"numbers in {'(' if open_low else '['}{low:g}, {high:g}{')' if open_high else ']'}"
 
 
 def check_choice(field: str, value: object, allowed: tuple[str, ...] | list[str]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -63,3 +64,13 @@ def test_every_patch_has_a_target() -> None:
             for part in path.split("."):
                 assert part in vars(owner), patch.target
                 owner = vars(owner)[part]
+
+
+def test_the_readme_lists_them() -> None:
+    """Rows of the table are the registered faults, in their order."""
+    text = (Path(__file__).parents[2] / "README.md").read_text().split("### Planted faults")[1].split("</details>")[0]
+    rows = [line.split(" | ") for line in text.splitlines() if line.startswith("| `dsfit")]
+    assert [row[1].replace("\\|", "|") for row in rows] == [fault.slip for fault in FAULTS.values()]
+    assert [row[2] for row in rows] == [fault.suite for fault in FAULTS.values()]
+    nothing = [row[3].startswith("nothing reported") for row in rows]
+    assert nothing == [not fault.caught for fault in FAULTS.values()]
