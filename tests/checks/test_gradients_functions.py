@@ -64,6 +64,13 @@ def test_bsdf_in_every_field_of_the_fiber(model: str) -> None:
     assert set(seen) == set(FIBER.parameters()) and {name for name, size in seen.items() if size == 0} == unused
 
 
+def test_a_fiber_at_the_end_of_its_ranges() -> None:
+    """No absorption and no glint: nothing can be subtracted, so the derivatives are taken a little inside."""
+    fiber = dsfit.Fiber.preset("nonabsorbing", glint_scale=0.0, caustic_max_offset=1.0)
+    for check in fn.bsdf_in_fiber(dsfit.DualScattering(fiber), fn.directions(5, generator(2))):
+        assert check.worst <= 1 and check.unclear_share <= 0.1, check.name
+
+
 def test_bsdf_in_directions() -> None:
     bsdf = dsfit.DualScattering(FIBER, d_b=0.0)
     at = fn.directions(200, generator(3))

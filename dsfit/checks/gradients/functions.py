@@ -25,6 +25,7 @@ from dsfit.proposals.parameters import Given
 
 _VECTORS = ("sigma_a", "alpha", "beta")
 _STEPS = {"eccentricity": 0.05, "eta": 0.05, "caustic_max_offset": 0.05}  # rad, and what fits into the ranges
+_ROOM = 0.05  # from an end of a field's range
 _WAY = "distance"
 INTERPOLATED = 1e-9
 """The averages are Chebyshev series on panels that meet to some 1e-12; their slopes jump there by a few hundred times
@@ -74,9 +75,10 @@ def bsdf_in_fiber(bsdf: DualScattering, at: dict[str, Tensor]) -> Iterator[Deriv
     they have fields of their own, and what the averages are made of (energies of both halves, and the averages from
     given shares); the integrals between those two are `bsdf_in_averages`.
 
-    Exact azimuths, whatever the BSDF's precision.
+    Exact azimuths, whatever the BSDF's precision. A value at an end of its range (no absorption) is moved inside, as
+    differences need room on both sides.
     """
-    base = bsdf.fiber.to(torch.float64).parameters()
+    base = _inside(bsdf.fiber.to(torch.float64).parameters())
     convention = bsdf.convention
     shares = torch.linspace(0.05, 0.25, 3 * bsdf.channels, dtype=torch.float64).reshape(3, -1)
 
@@ -109,6 +111,12 @@ def bsdf_in_fiber(bsdf: DualScattering, at: dict[str, Tensor]) -> Iterator[Deriv
     for name, value in base.items():
         step: float = _STEPS.get(name, 0.5 * float(value[value != 0].abs().min()) if bool((value != 0).any()) else 0.1)
         yield check_derivative(function, base, name, step=min(step, 0.1), levels=9, at_once=True)
+
+
+def _inside(fields: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The fields with room on both sides."""
+    moved = {name: fields[name].clamp_min(_ROOM) for name in ("sigma_a", "glint_scale", "caustic_max_offset")}
+    return {**fields, **moved, "caustic_max_offset": moved["caustic_max_offset"].clamp_max(1 - 2 * _ROOM)}
 
 
 def bsdf_in_averages(
