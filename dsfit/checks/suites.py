@@ -11,9 +11,12 @@ A suite's module offers `run(..., say=..., **options) -> Outcome`, by its scope:
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Literal
+
+from dsfit.errors import check_choice
 
 
 @dataclass(frozen=True)
@@ -40,3 +43,14 @@ SUITES: dict[str, Suite] = {
     "controls": Suite("dsfit.checks.controls", "once", "the chapter's wrong equations, which must be rejected"),
     "faults": Suite("dsfit.checks.faults", "once", "faults planted into the library, which must be caught"),
 }
+
+
+def chosen(field: str, names: str | Iterable[str], known: Iterable[str]) -> list[str]:
+    """The parts that an option asks for: "all" that are known, or those named.
+
+    Raises:
+        InputError: a name that is not known.
+    """
+    if names == "all":
+        return list(known)
+    return [check_choice(field, name, tuple(known)) for name in names]

@@ -107,6 +107,12 @@ def hotelling(values: Tensor, truth: Tensor, truth_error: Tensor) -> Agreement:
     )
 
 
+def z_test(values: Tensor, truth: float) -> float:
+    """Two-sided p-value that many independent values `[N]` have this mean; normal by their number."""
+    z = (float(values.mean()) - truth) / (float(values.std()) / math.sqrt(len(values)))
+    return float(2 * stats.norm.sf(abs(z)))
+
+
 def run(
     subject: Subject,
     *,
@@ -166,4 +172,4 @@ def _finding(subject: str, case: str, found: Agreement) -> Finding:
     return Finding(SUITE, subject, case, p_value=found.p_value, unclear=unclear, detail=detail, data=data)
 
 
-__all__ = ["Agreement", "agreement", "hotelling", "run"]
+__all__ = ["Agreement", "agreement", "hotelling", "run", "z_test"]

@@ -14,7 +14,7 @@ import numpy as np
 from dsfit.checks.suites import SUITES
 from dsfit.errors import InputError
 from dsfit.experiment import build
-from dsfit.experiment.methods import chapter_names
+from dsfit.experiment.methods import chapter_names, single_proposals, structured_start
 from dsfit.experiment.schema import Config
 
 if TYPE_CHECKING:
@@ -78,23 +78,18 @@ def run_suite(
 def proposals_of(config: Config, integrand: Integrand, context: Context) -> dict[str, Proposal]:
     """The proposals that `[check]` names, at a single context, by name."""
     from dsfit.experiment.store import load_proposal
-    from dsfit.proposals import Mixture, StructuredProposal, chapter_proposals
-    from dsfit.scene import ConstantLight
+    from dsfit.proposals import Mixture
 
-    bsdf, light = integrand.bsdf, integrand.light
     names = config.check.proposals
-    chapter = chapter_proposals(bsdf, back_azimuth=bsdf.convention.back_azimuth, learnable=False)
+    single = single_proposals(integrand)
     found: dict[str, Proposal] = {}
     for name in [n for n in known_names() if n != "fitted"] if names == "all" else names:
-        if name in chapter:
-            found[name] = chapter[name]
-        elif name == "light":
-            found[name] = light.proposal()
+        if name in single:
+            found[name] = single[name]
         elif name == "mixture":
-            found[name] = Mixture(list(chapter.values()), defensive=DEFENSIVE)
+            found[name] = Mixture([single[n] for n in chapter_names()], defensive=DEFENSIVE)
         else:
-            extra = {} if isinstance(light, ConstantLight) else {"light": light.proposal()}
-            found[name] = StructuredProposal(bsdf, context, extra=extra)
+            found[name] = structured_start(integrand, context)
             if name == "fitted":
                 from dsfit.fit.fit import fit
 

@@ -35,11 +35,7 @@ class Setting:
     @functools.cached_property
     def proposals(self) -> dict[str, nn.Module]:
         """The chapter's proposals for this fibre and the light's, by name."""
-        from dsfit.proposals import chapter_proposals
-
-        bsdf = self.integrand.bsdf
-        found = dict(chapter_proposals(bsdf, back_azimuth=bsdf.convention.back_azimuth, learnable=False))
-        return {**found, "light": self.integrand.light.proposal()}
+        return single_proposals(self.integrand)
 
     @functools.cached_property
     def nodes(self) -> Any:
@@ -194,13 +190,9 @@ def _fitted(method: FittedMethod, setting: Setting) -> Plan:
     """Fit the family to this context; the fit's time includes its quadrature nodes and the tables of its azimuths."""
     from dsfit.fit.fit import fit
     from dsfit.fit.optimistix_solvers import least_squares  # noqa: F401  (importing JAX is not part of the fit)
-    from dsfit.proposals.structured import StructuredProposal
-    from dsfit.scene import ConstantLight
 
     nodes, clock = setting.nodes, time.perf_counter()
-    light = setting.integrand.light
-    extra = {} if isinstance(light, ConstantLight) else {"light": light.proposal()}
-    start = StructuredProposal(setting.integrand.bsdf, setting.context, method.defensive, extra=extra)
+    start = structured_start(setting.integrand, setting.context, defensive=method.defensive)
     start_seconds = time.perf_counter() - clock
     if method.max_steps == 0:
         return Plan([start.requires_grad_(False)], [method.family], fit={"seconds": start_seconds})
@@ -224,6 +216,25 @@ def _fitted(method: FittedMethod, setting: Setting) -> Plan:
         "mass_at_nodes": found.mass,
     }
     return Plan([found.proposal.requires_grad_(False)], [method.family], fit=facts, fitted=True)
+
+
+def single_proposals(integrand: Any) -> dict[str, nn.Module]:
+    """The chapter's proposals for this fibre and the light's, by name; with nothing to learn."""
+    from dsfit.proposals import chapter_proposals
+
+    bsdf = integrand.bsdf
+    found = dict(chapter_proposals(bsdf, back_azimuth=bsdf.convention.back_azimuth, learnable=False))
+    return {**found, "light": integrand.light.proposal()}
+
+
+def structured_start(integrand: Any, context: Context, **options: Any) -> nn.Module:
+    """The structured family as it starts, with the light's proposal where there is a light to find."""
+    from dsfit.proposals.structured import StructuredProposal
+    from dsfit.scene import ConstantLight
+
+    light = integrand.light
+    extra = {} if isinstance(light, ConstantLight) else {"light": light.proposal()}
+    return StructuredProposal(integrand.bsdf, context, extra=extra, **options)
 
 
 def check_method(raw: RawConfig, index: int, method: Any) -> None:

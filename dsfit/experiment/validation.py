@@ -61,18 +61,19 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Experiment:
 
 def _anchor_paths(raw: RawConfig) -> None:
     """Paths are relative to the file that names them, or to the working directory when given by `--set`."""
-    path = raw.lookup(("light", "path"))
-    if isinstance(path, str) and path and "\0" not in path:
-        source = raw.source(("light", "path"))
-        folder = Path(source).parent if Path(source).is_file() else Path()
-        raw.data["light"]["path"] = str((folder / path).resolve())
+
+    def anchored(key: tuple[str, str], path: Any) -> Any:
+        if not isinstance(path, str) or not path or "\0" in path:
+            return path  # refused later
+        source = Path(raw.source(key))
+        return str(((source.parent if source.is_file() else Path()) / path).resolve())
+
+    if raw.lookup(("light", "path")) is not None:
+        raw.data["light"]["path"] = anchored(("light", "path"), raw.lookup(("light", "path")))
     for key in ("saved", "user"):
         paths = raw.lookup(("check", key))
-        for k, item in enumerate(paths if isinstance(paths, list) else []):
-            if isinstance(item, str) and item and "\0" not in item:
-                source = raw.source(("check", key))
-                folder = Path(source).parent if Path(source).is_file() else Path()
-                paths[k] = str((folder / item).resolve())
+        if isinstance(paths, list):
+            paths[:] = [anchored(("check", key), path) for path in paths]
 
 
 def validate(raw: RawConfig) -> Config:

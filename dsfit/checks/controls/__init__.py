@@ -18,6 +18,7 @@ from dsfit.checks.controls import azimuth, backscatter, longitudinal, scattering
 from dsfit.checks.controls.base import SUITE, Control, Trial, Typo
 from dsfit.checks.controls.scene import SCENE
 from dsfit.checks.subject import Outcome, Say, silent
+from dsfit.checks.suites import chosen
 from dsfit.errors import check_choice
 
 
@@ -58,9 +59,7 @@ def parts(controls: Any = "all") -> list[str]:
     Raises:
         InputError: a name that no control has.
     """
-    if controls == "all":
-        return list(CONTROLS)
-    return [check_choice("check.controls.controls", name, tuple(CONTROLS)) for name in controls]
+    return chosen("check.controls.controls", controls, CONTROLS)
 
 
 def trial(name: str, seed: int = 1) -> Trial:

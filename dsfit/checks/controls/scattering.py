@@ -29,6 +29,7 @@ from dsfit.checks.controls.scene import (
     ratio,
     terms,
 )
+from dsfit.checks.unbiased import z_test
 from dsfit.frame import cos_inclination, theta_diff, to_vector
 from dsfit.material import Material
 from dsfit.proposals.structured import StructuredProposal
@@ -63,12 +64,7 @@ def pbrt_cosine(seed: int) -> Trial:
     share = float((right.weight * right.total * cos_inclination(right.theta_i) * torch.cos(right.phi).abs()).sum())
     share /= right.integral()
     effect = f"×{share:.3f} (viewer at φ_r = 0)"
-    return Trial(_z_test(printed, truth), _z_test(corrected, truth), None, effect, {"ratio": share})
-
-
-def _z_test(values: Tensor, truth: float) -> float:
-    z = (float(values.mean()) - truth) / (float(values.std()) / math.sqrt(len(values)))
-    return float(2 * stats.norm.sf(abs(z)))
+    return Trial(z_test(printed, truth), z_test(corrected, truth), None, effect, {"ratio": share})
 
 
 @CONTROLS.add(

@@ -15,7 +15,7 @@ from dsfit.checks.faults.library import FAULTS
 from dsfit.checks.faults.planting import Fault, Patch, planted
 from dsfit.checks.finding import Finding, judge
 from dsfit.checks.subject import Outcome, Say, silent
-from dsfit.errors import InputError
+from dsfit.checks.suites import chosen
 
 SUITE = "faults"
 _LEVEL = 1e-6  # of the checks: a catch has to be beyond doubt, and nothing may be caught by chance
@@ -27,12 +27,7 @@ def parts(faults: Any = "all") -> list[str]:
     Raises:
         InputError: an unknown name.
     """
-    if faults == "all":
-        return list(FAULTS)
-    for name in faults:
-        if name not in FAULTS:
-            raise InputError("faults", name, "one of " + ", ".join(FAULTS))
-    return list(faults)
+    return chosen("faults", faults, FAULTS)
 
 
 def run(part: str, *, seed: int, say: Say = silent, faults: Any = "all") -> Outcome:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -11,6 +10,7 @@ from torch import Tensor
 from dsfit.checks.faults import looks
 from dsfit.checks.faults.planting import Fault, Patch, changed
 from dsfit.checks.finding import Finding
+from dsfit.checks.unbiased import z_test
 from dsfit.context import Context
 from dsfit.proposals.base import Proposal
 
@@ -40,8 +40,7 @@ def _moment(seed: int) -> list[Finding]:
         norm = float(reference(integrand, context, 1e-6).norm)
         claimed = float(excess(integrand, proposal, context).value)
     squares = (weight / norm) ** 2
-    z = (float(squares.mean()) - 1 - claimed) / float(squares.std() / math.sqrt(len(squares)))
-    return [Finding("unbiased", "excess", "quadrature against samples", p_value=math.erfc(abs(z) / math.sqrt(2)))]
+    return [Finding("unbiased", "excess", "quadrature against samples", p_value=z_test(squares, 1 + claimed))]
 
 
 def _fit(seed: int) -> list[Finding]:
@@ -81,8 +80,7 @@ def _material(seed: int) -> list[Finding]:
         found = material.sample_f(wo, u)
         weight = (found.f * (found.wi[..., 1].abs() / found.pdf).unsqueeze(-1)).mean(-1)
         truth = float(reference(material._integrand, context, 1e-6).value.mean())
-    z = (float(weight.mean()) - truth) / float(weight.std() / math.sqrt(len(weight)))
-    return [Finding("furnace", "material", "white furnace", p_value=math.erfc(abs(z) / math.sqrt(2)))]
+    return [Finding("furnace", "material", "white furnace", p_value=z_test(weight, truth))]
 
 
 def _equal_power(log_weights: Any) -> Any:

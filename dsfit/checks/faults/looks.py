@@ -13,7 +13,6 @@ from dsfit.checks.subject import Subject
 from dsfit.context import Context
 from dsfit.proposals.base import Proposal
 from dsfit.scene.integrand import Integrand
-from dsfit.scene.lights import Light
 
 THETA_R, PHI_R = 0.6, 0.4
 Look = Callable[[int], list[Finding]]
@@ -45,7 +44,6 @@ def sampling(make: Callable[[Context], Proposal], n: float = 0.0, theta_r: float
 def estimating(
     make: Callable[[], dict[str, Proposal]],
     n: float = 0.0,
-    light: Callable[[], Light] | None = None,
     heuristics: Sequence[str] = ("balance",),
 ) -> Look:
     """Estimators against the quadrature."""
@@ -54,7 +52,7 @@ def estimating(
         from dsfit.checks.unbiased import run
 
         context = Context(THETA_R, PHI_R, n)
-        integrand = Integrand(bsdf("table" if n else "exact"), light=None if light is None else light())
+        integrand = Integrand(bsdf("table" if n else "exact"))
         return run(Subject(integrand, context, make(), "", seed), samples=100_000, heuristics=heuristics).findings
 
     return look

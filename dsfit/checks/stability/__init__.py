@@ -17,6 +17,7 @@ from dsfit.checks.stability import atlas
 from dsfit.checks.stability.function import CLASSES, Function, class_of
 from dsfit.checks.stability.measure import DTYPES, Errors, Measurement, measure
 from dsfit.checks.subject import Outcome, Say, silent
+from dsfit.checks.suites import chosen
 from dsfit.errors import check_choice
 
 SUITE = "stability"
@@ -30,10 +31,7 @@ def parts(*, functions: str | Sequence[str] = "all", digits: int = 50) -> list[s
     Raises:
         InputError: no such function.
     """
-    known = atlas.functions()
-    if functions == "all":
-        return list(known)
-    return [check_choice("functions", name, tuple(known)) for name in functions]
+    return chosen("functions", functions, atlas.functions())
 
 
 def run(

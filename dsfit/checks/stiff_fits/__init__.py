@@ -24,7 +24,7 @@ from dsfit.checks.stiff_fits.fits import FITS
 from dsfit.checks.stiff_fits.liars import LIARS, LIMITS, SOLVER, caught, honest_case, is_caught
 from dsfit.checks.stiff_fits.toys import TOYS
 from dsfit.checks.subject import Outcome, Say, silent
-from dsfit.errors import check_choice
+from dsfit.checks.suites import chosen
 from dsfit.fit.solvers import SOLVERS
 
 __all__ = ["PROBLEMS", "Examination", "Limits", "compare", "examine", "examine_all", "markdown", "parts", "run"]
@@ -44,17 +44,17 @@ def parts(
         InputError: an unknown problem or solver.
     """
     solver_names(solvers)
-    known = (*PROBLEMS, CONTROLS)
-    if isinstance(problems, str):
-        return list(known) if problems == "all" else [check_choice("problems", problems, known)]
-    return [check_choice("problems", name, known) for name in problems]
+    return _one_or_more("problems", problems, (*PROBLEMS, CONTROLS))
 
 
 def solver_names(solvers: str | Sequence[str]) -> list[str]:
     """The solvers meant; raises `InputError` for an unknown one."""
-    if isinstance(solvers, str):
-        return list(SOLVERS) if solvers == "all" else [check_choice("solvers", solvers, tuple(SOLVERS))]
-    return [check_choice("solvers", name, tuple(SOLVERS)) for name in solvers]
+    return _one_or_more("solvers", solvers, tuple(SOLVERS))
+
+
+def _one_or_more(field: str, names: str | Sequence[str], known: Sequence[str]) -> list[str]:
+    """`chosen`, which a single name may be given to as well."""
+    return chosen(field, [names] if isinstance(names, str) and names != "all" else names, known)
 
 
 def examine_all(cases: Sequence[Case], solvers: Sequence[str], limits: Limits, say: Say = silent) -> list[Examination]:
