@@ -133,9 +133,8 @@ def _panels(edges: Tensor, pilots: Sequence[Tensor], count: int) -> Tensor:
         starts.append(_quantiles(pilot, torch.cat([inner, ends, 1 - ends])))
     start = torch.cat(starts)
     apart = (start[:, None] - edges).abs().min(dim=1).values > _NARROWEST
-    found = _distinct(torch.cat([start[apart], edges]), float(edges[0]), float(edges[-1]))
-    # `_distinct` drops the later of two that are close, so the cells' own edges are put back
-    return _graded(torch.unique(torch.cat([found[(found[:, None] - edges).abs().min(dim=1).values > 0], edges])))
+    # edges keep their distance from each other and from these quantiles: `_distinct` drops quantiles only
+    return _graded(_distinct(torch.cat([start[apart], edges]), float(edges[0]), float(edges[-1])))
 
 
 def _graded(edges: Tensor) -> Tensor:
