@@ -19,6 +19,7 @@ from dsfit.special import wrapped_normal_log_prob
 AzimuthalModel = Literal["marschner", "raw", "simplified"]
 _CHUNK = 512
 AZIMUTHAL_MODELS: tuple[str, ...] = ("marschner", "raw", "simplified")
+ALL_LOBES = (0, 1, 2)
 
 
 def refractions(fiber: Fiber, theta_diff: Tensor, phi_h: Tensor | None) -> tuple[Refraction, Refraction, Refraction]:
@@ -28,11 +29,17 @@ def refractions(fiber: Fiber, theta_diff: Tensor, phi_h: Tensor | None) -> tuple
 
 
 def azimuthal(
-    fiber: Fiber, theta_diff: Tensor, phi: Tensor, phi_h: Tensor | None, model: AzimuthalModel, absorption: Absorption
+    fiber: Fiber,
+    theta_diff: Tensor,
+    phi: Tensor,
+    phi_h: Tensor | None,
+    model: AzimuthalModel,
+    absorption: Absorption,
+    lobes: tuple[int, ...] = ALL_LOBES,
 ) -> Tensor:
-    """N_p(theta_diff, phi) = (1/2) sum over roots of A(p, h) |dphi/dh|^-1, `[..., 3, C]`, per radian.
+    """N_p(theta_diff, phi) = (1/2) sum over roots of A(p, h) |dphi/dh|^-1, `[..., len(lobes), C]`, per radian.
 
-    Even in phi. `marschner` treats the TRT caustic, `raw` leaves it (unbounded at the caustic), `simplified` is N_R,
+    `lobes` are some of 0, 1, 2: R, TT, TRT. Even in phi. `marschner` treats the TRT caustic, `raw` leaves it (unbounded at the caustic), `simplified` is N_R,
     N_TRT ~ cos(phi/2), N_TT ~ g(phi - pi; gamma_TT) (chapter eqs 21, 25) times each lobe's energy E_p; see
     `simplified_shapes`.
     """
@@ -40,11 +47,13 @@ def azimuthal(
     bent = refractions(fiber, theta_diff, phi_h)
     if model == "simplified":
         energies = lobe_energies(bent, fiber.sigma_a, absorption)
-        return simplified_shapes(fiber, phi).unsqueeze(-1) * energies
-    n_r = _n_r(fiber, bent[0], phi, absorption)
-    n_tt = _n_tt(fiber, bent[1], phi, absorption)
-    n_trt = _n_trt(fiber, bent[2], phi, model, absorption)
-    return torch.stack(torch.broadcast_tensors(n_r, n_tt, n_trt), dim=-2)
+        return (simplified_shapes(fiber, phi).unsqueeze(-1) * energies)[..., list(lobes), :]
+    values = (
+        lambda: _n_r(fiber, bent[0], phi, absorption),
+        lambda: _n_tt(fiber, bent[1], phi, absorption),
+        lambda: _n_trt(fiber, bent[2], phi, model, absorption),
+    )
+    return torch.stack(torch.broadcast_tensors(*(values[p]() for p in lobes)), dim=-2)
 
 
 def simplified_shapes(fiber: Fiber, phi: Tensor) -> Tensor:
@@ -91,10 +100,16 @@ def _n_trt(fiber: Fiber, bent: Refraction, phi: Tensor, model: AzimuthalModel, a
 
 
 def azimuthal_scattered(
-    fiber: Fiber, theta_diff: Tensor, phi: Tensor, phi_h: Tensor | None, model: AzimuthalModel, absorption: Absorption
+    fiber: Fiber,
+    theta_diff: Tensor,
+    phi: Tensor,
+    phi_h: Tensor | None,
+    model: AzimuthalModel,
+    absorption: Absorption,
+    lobes: tuple[int, ...] = ALL_LOBES,
 ) -> Tensor:
-    """N^G_p(phi) = (1/pi) int_{-pi/2}^{pi/2} N_p(theta_diff, wrap(phi - phi')) dphi', `[..., 3, C]`, per radian (eq 11
-    as a convolution).
+    """N^G_p(phi) = (1/pi) int_{-pi/2}^{pi/2} N_p(theta_diff, wrap(phi - phi')) dphi' of `lobes`, `[..., len(lobes), C]`,
+    per radian (eq 11 as a convolution).
 
     A difference of the cumulative azimuth, which is an integral over offsets and so smooth even where N_p is infinite;
     int N^G = int N. For an eccentric fibre the index of TRT is that of the unscattered pair of directions (phi_h is
@@ -102,16 +117,22 @@ def azimuthal_scattered(
     """
     theta_diff, phi = torch.broadcast_tensors(theta_diff, wrap(phi).abs())
     if not fiber.batch_shape and phi.numel() > _CHUNK:
-        return _in_chunks(fiber, theta_diff, phi, phi_h, model, absorption)
+        return _in_chunks(fiber, theta_diff, phi, phi_h, model, absorption, lobes)
     bent = refractions(fiber, theta_diff, phi_h)
     if model == "simplified":
         energies = lobe_energies(bent, fiber.sigma_a, absorption)
-        return simplified_windows(fiber, phi).unsqueeze(-1) * energies / math.pi
-    return offset_windows(fiber, bent, phi, model, absorption) / math.pi
+        return (simplified_windows(fiber, phi).unsqueeze(-1) * energies / math.pi)[..., list(lobes), :]
+    return offset_windows(fiber, bent, phi, model, absorption, lobes) / math.pi
 
 
 def _in_chunks(
-    fiber: Fiber, theta_diff: Tensor, phi: Tensor, phi_h: Tensor | None, model: AzimuthalModel, absorption: Absorption
+    fiber: Fiber,
+    theta_diff: Tensor,
+    phi: Tensor,
+    phi_h: Tensor | None,
+    model: AzimuthalModel,
+    absorption: Absorption,
+    lobes: tuple[int, ...],
 ) -> Tensor:
     """Hundreds of attenuations per direction: a few hundred directions at a time stay in cache (several times
     faster).
@@ -121,15 +142,21 @@ def _in_chunks(
     rows = [x.expand(shape).reshape(-1).split(_CHUNK) for x in given]
     parts = []
     for row in zip(*rows, strict=True):
-        parts.append(azimuthal_scattered(fiber, row[0], row[1], row[2] if len(row) > 2 else None, model, absorption))
+        orientation = row[2] if len(row) > 2 else None
+        parts.append(azimuthal_scattered(fiber, row[0], row[1], orientation, model, absorption, lobes))
     return torch.cat(parts).reshape(*shape, *parts[0].shape[-2:])
 
 
 def azimuthal_constant(
-    fiber: Fiber, theta_diff: Tensor, phi_h: Tensor | None, model: AzimuthalModel, absorption: Absorption
+    fiber: Fiber,
+    theta_diff: Tensor,
+    phi_h: Tensor | None,
+    model: AzimuthalModel,
+    absorption: Absorption,
+    lobes: tuple[int, ...] = ALL_LOBES,
 ) -> Tensor:
     """N^G as eq (11) prints it: (1/pi) int_{-pi/2}^{pi/2} N_p(theta_diff, phi') dphi', the same for every phi."""
-    return azimuthal_scattered(fiber, theta_diff, torch.zeros_like(theta_diff), phi_h, model, absorption)
+    return azimuthal_scattered(fiber, theta_diff, torch.zeros_like(theta_diff), phi_h, model, absorption, lobes)
 
 
 def support_edges(fiber: Fiber, theta_diff: Tensor, phi_h: Tensor | None = None) -> Tensor:

@@ -20,9 +20,14 @@ _FLANK = 8.0  # standard deviations from a glint to where nothing is removed any
 
 
 def offset_windows(
-    fiber: Fiber, bent: tuple[Refraction, ...], phi: Tensor, model: str, absorption: Absorption
+    fiber: Fiber,
+    bent: tuple[Refraction, ...],
+    phi: Tensor,
+    model: str,
+    absorption: Absorption,
+    lobes: tuple[int, ...] = (0, 1, 2),
 ) -> Tensor:
-    """Window masses of R, TT, TRT at |phi| in [0, pi], `[..., 3, C]`.
+    """Window masses of `lobes`, some of R, TT, TRT, at |phi| in [0, pi], `[..., len(lobes), C]`.
 
     A window of half width pi/2 around phi reaches over both sides of 0 (phi <= pi/2) or of pi. By symmetry its mass is
     a sum of two one-sided masses, both between 0 and psi or both between psi and pi, so that nothing cancels: phi <=
@@ -36,12 +41,12 @@ def offset_windows(
     inner = near.unsqueeze(-1)
     sigma_a = fiber.sigma_a.unsqueeze(-2)
     nodes = _node_count(fiber, model)
-    parts = [
-        _mass_r(wide[0], sigma_a, psi, inner, absorption, nodes).sum(-2),
-        _mass_tt(wide[1], sigma_a, psi, inner, absorption, nodes).sum(-2),
-        _mass_trt(fiber, bent[2], phi, psi, inner, model, absorption, nodes),
-    ]
-    return torch.stack(torch.broadcast_tensors(*parts), dim=-2)
+    masses = (
+        lambda: _mass_r(wide[0], sigma_a, psi, inner, absorption, nodes).sum(-2),
+        lambda: _mass_tt(wide[1], sigma_a, psi, inner, absorption, nodes).sum(-2),
+        lambda: _mass_trt(fiber, bent[2], phi, psi, inner, model, absorption, nodes),
+    )
+    return torch.stack(torch.broadcast_tensors(*(masses[p]() for p in lobes)), dim=-2)
 
 
 def _node_count(fiber: Fiber, model: str) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 
@@ -59,8 +60,23 @@ class AzimuthTable:
             both = spline_coefficients(rows.transpose(0, 1), even_end=True).transpose(0, 1)
         self._flat = {torch.float64: both.reshape(-1, both.shape[-1]).contiguous()}
 
+    @property
+    def coefficients(self) -> Tensor:
+        """B-spline coefficients `[rows + 2, columns + 2, 3, C]` over (theta_diff, |phi|); B-splines are positive and sum
+        to one, so a value lies between the least and the largest of the 4 x 4 coefficients around it."""
+        return self._flat[torch.float64].reshape(_ROWS + 2, _COLUMNS + 2, *self.tail)
+
+    def select(self, lobes: tuple[int, ...]) -> AzimuthTable:
+        """The table of some of the lobes, which costs as much less to look up."""
+        if lobes == tuple(range(self.tail[0])):
+            return self
+        part = copy.copy(self)
+        part.tail = torch.Size((len(lobes), *self.tail[1:]))
+        part._flat = {torch.float64: self.coefficients[:, :, list(lobes)].reshape(-1, part.tail.numel()).contiguous()}
+        return part
+
     def __call__(self, theta_diff: Tensor, phi: Tensor) -> Tensor:
-        """Values `[..., 3, C]`."""
+        """Values `[..., lobes, C]`."""
         theta_diff, phi = torch.broadcast_tensors(theta_diff.abs(), phi.abs())
         if phi.dtype not in self._flat:
             self._flat[phi.dtype] = self._flat[torch.float64].to(phi.dtype)
