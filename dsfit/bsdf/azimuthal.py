@@ -39,9 +39,9 @@ def azimuthal(
 ) -> Tensor:
     """N_p(theta_diff, phi) = (1/2) sum over roots of A(p, h) |dphi/dh|^-1, `[..., len(lobes), C]`, per radian.
 
-    `lobes` are some of 0, 1, 2: R, TT, TRT. Even in phi. `marschner` treats the TRT caustic, `raw` leaves it (unbounded at the caustic), `simplified` is N_R,
-    N_TRT ~ cos(phi/2), N_TT ~ g(phi - pi; gamma_TT) (chapter eqs 21, 25) times each lobe's energy E_p; see
-    `simplified_shapes`.
+    `lobes` are some of 0, 1, 2: R, TT, TRT. Even in phi. `marschner` treats the TRT caustic, `raw` leaves it
+    (unbounded at the caustic), `simplified` is N_R, N_TRT ~ cos(phi/2), N_TT ~ g(phi - pi; gamma_TT) (chapter eqs 21,
+    25) times each lobe's energy E_p; see `simplified_shapes`.
     """
     theta_diff, phi = torch.broadcast_tensors(theta_diff, wrap(phi).abs())
     bent = refractions(fiber, theta_diff, phi_h)
@@ -108,8 +108,8 @@ def azimuthal_scattered(
     absorption: Absorption,
     lobes: tuple[int, ...] = ALL_LOBES,
 ) -> Tensor:
-    """N^G_p(phi) = (1/pi) int_{-pi/2}^{pi/2} N_p(theta_diff, wrap(phi - phi')) dphi' of `lobes`, `[..., len(lobes), C]`,
-    per radian (eq 11 as a convolution).
+    """N^G_p(phi) = (1/pi) int_{-pi/2}^{pi/2} N_p(theta_diff, wrap(phi - phi')) dphi', `[..., len(lobes), C]`, per
+    radian (eq 11 as a convolution).
 
     A difference of the cumulative azimuth, which is an integral over offsets and so smooth even where N_p is infinite;
     int N^G = int N. For an eccentric fibre the index of TRT is that of the unscattered pair of directions (phi_h is

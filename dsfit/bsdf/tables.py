@@ -62,8 +62,8 @@ class AzimuthTable:
 
     @property
     def coefficients(self) -> Tensor:
-        """B-spline coefficients `[rows + 2, columns + 2, 3, C]` over (theta_diff, |phi|); B-splines are positive and sum
-        to one, so a value lies between the least and the largest of the 4 x 4 coefficients around it."""
+        """B-spline coefficients `[rows + 2, columns + 2, 3, C]` over (theta_diff, |phi|); B-splines are positive and
+        sum to one, so a value lies between the least and the largest of the 4 x 4 coefficients around it."""
         return self._flat[torch.float64].reshape(_ROWS + 2, _COLUMNS + 2, *self.tail)
 
     def select(self, lobes: tuple[int, ...]) -> AzimuthTable:
