@@ -5,7 +5,9 @@ Under `torch.func` transforms the numbers cannot be asked for, and only shapes a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
 
 import torch
 from torch import Tensor
@@ -29,7 +31,21 @@ def check_inside(field: str, value: Tensor, low: float, high: float) -> Tensor:
     if is_wrapped(data) or not data.numel():
         return value
     least, most = (float(x) for x in torch.aminmax(data))
-    return value if low <= least and most <= high and most < torch.inf else check_range(field, value, low, high)
+    inside = low <= least and most <= high and -torch.inf < least and most < torch.inf
+    return value if inside else check_range(field, value, low, high)
+
+
+_CHECKED: ContextVar[Tensor | None] = ContextVar("checked", default=None)
+
+
+@contextlib.contextmanager
+def checked(value: Tensor) -> Iterator[None]:
+    """Inside, this very tensor is taken as finite: a mixture looks at it once, not once for every component."""
+    token = _CHECKED.set(value)
+    try:
+        yield
+    finally:
+        _CHECKED.reset(token)
 
 
 def check_directions(omega: Tensor, batch: Sequence[int] = (), field: str = "omega") -> Tensor:
@@ -43,7 +59,7 @@ def check_directions(omega: Tensor, batch: Sequence[int] = (), field: str = "ome
         raise InputError(field, getattr(omega, "dtype", omega), "a float64 or float32 tensor")
     if omega.ndim == 0 or omega.shape[-1] != 2 or _broadcast(omega.shape[:-1], batch) is None:
         raise InputError(field, tuple(omega.shape), f"shape {_shape(batch, 2)}: (theta, phi) for each context")
-    return omega if all_finite(omega) else check_finite(field, omega)
+    return omega if omega is _CHECKED.get() or all_finite(omega) else check_finite(field, omega)
 
 
 def check_uniforms(u: Tensor, dimension: int, batch: Sequence[int] = (), field: str = "u") -> Tensor:
@@ -74,6 +90,8 @@ def check_uniforms(u: Tensor, dimension: int, batch: Sequence[int] = (), field: 
 
 
 def _broadcast(a: Sequence[int], b: Sequence[int]) -> torch.Size | None:
+    if not len(b) or tuple(a[-len(b) :]) == tuple(b):  # torch's own answer takes 40 microseconds
+        return torch.Size(a)
     try:
         return torch.broadcast_shapes(a, b)
     except RuntimeError:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from dsfit.errors import as_real, check_broadcast, check_range, common_dtype
+from dsfit.arguments import check_inside
+from dsfit.errors import as_real, check_broadcast, common_dtype
 from dsfit.frame import HALF_PI
+
+_LIMIT = {dtype: torch.tensor(HALF_PI, dtype=dtype).item() for dtype in (torch.float64, torch.float32)}
 
 
 @dataclass(frozen=True, init=False)
@@ -41,14 +45,13 @@ class Context:
         dtype, device = common_dtype("context.dtype", dtype, (theta_r, phi_r, n, v))
         given = {"theta_r": theta_r, "phi_r": phi_r, "n": n}
         fields = [as_real(f"context.{name}", value, dtype, device) for name, value in given.items()]
-        limit = torch.tensor(HALF_PI, dtype=dtype).item()
-        check_range("context.theta_r", fields[0], -limit, limit)
-        check_range("context.phi_r", fields[1])
-        check_range("context.n", fields[2], 0.0)
+        check_inside("context.theta_r", fields[0], -_LIMIT[dtype], _LIMIT[dtype])
+        check_inside("context.phi_r", fields[1], -math.inf, math.inf)
+        check_inside("context.n", fields[2], 0.0, math.inf)
         if v is None:
             share = (fields[2] == 0).to(dtype)
         else:
-            share = check_range("context.v", as_real("context.v", v, dtype, device), 0.0, 1.0)
+            share = check_inside("context.v", as_real("context.v", v, dtype, device), 0.0, 1.0)
         check_broadcast(theta_r=fields[0], phi_r=fields[1], n=fields[2], v=share)
         for name, value in zip(("theta_r", "phi_r", "n", "v"), torch.broadcast_tensors(*fields, share), strict=True):
             object.__setattr__(self, name, value)
@@ -69,11 +72,15 @@ class Context:
         return self.theta_r.device
 
     def _map(self, function: Any) -> Context:
-        return Context(function(self.theta_r), function(self.phi_r), function(self.n), function(self.v))
+        """The context with a function that changes no number applied to every field; so nothing is checked again."""
+        result = object.__new__(Context)
+        for name in ("theta_r", "phi_r", "n", "v"):
+            object.__setattr__(result, name, function(getattr(self, name)))
+        return result
 
     def to(self, *args: Any, **kwargs: Any) -> Context:
         """The same context in another dtype or on another device (arguments of `Tensor.to`)."""
-        return self._map(lambda x: x.to(*args, **kwargs))
+        return Context(*(x.to(*args, **kwargs) for x in (self.theta_r, self.phi_r, self.n, self.v)))
 
     def reshape(self, *shape: int) -> Context:
         """The same contexts in another batch shape."""

@@ -80,11 +80,14 @@ def as_number(field: str, value: Any, low: float = -float("inf"), high: float = 
 
 def check_broadcast(**values: Tensor) -> torch.Size:
     """The shape that the tensors broadcast to; `InputError` with all their shapes if they do not."""
+    shapes = {value.shape for value in values.values() if value.ndim}
+    if len(shapes) <= 1:  # nearly always; torch's own answer takes 40 microseconds
+        return shapes.pop() if shapes else torch.Size()
     try:
-        return torch.broadcast_shapes(*(value.shape for value in values.values()))
+        return torch.broadcast_shapes(*shapes)
     except RuntimeError:
-        shapes = {name: tuple(value.shape) for name, value in values.items()}
-        raise InputError(", ".join(values), shapes, "shapes that broadcast") from None
+        given = {name: tuple(value.shape) for name, value in values.items()}
+        raise InputError(", ".join(values), given, "shapes that broadcast") from None
 
 
 def check_finite(field: str, value: Tensor) -> Tensor:

@@ -194,13 +194,13 @@ def averages_from_shares(fiber: Fiber, convention: Convention, front: Tensor, ba
     beta_p); likewise backward. Where all shares underflow, as for narrow lobes that leave the reachable inclinations,
     shifts and widths are plain means.
     """
-    a_f, a_b = front.sum(-2), back.sum(-2)
+    a_f, a_b = _over_lobes(front), _over_lobes(back)
     tiny = torch.finfo(a_f.dtype).tiny
     alpha, beta = fiber.alpha.unsqueeze(-1), fiber.beta.unsqueeze(-1)
 
     def mean(share: Tensor, value: Tensor) -> Tensor:
         weight = share + tiny**0.5
-        return (weight * value).sum(-2) / weight.sum(-2)
+        return _over_lobes(weight * value) / _over_lobes(weight)
 
     if convention.mean_width == "variance":
         beta_f, beta_b = (torch.sqrt(mean(share, beta**2)) for share in (front, back))
@@ -221,3 +221,9 @@ def averages_from_shares(fiber: Fiber, convention: Convention, front: Tensor, ba
         delta_b=back_shift(a_f, a_b, alpha_f, alpha_b, convention.shift_sign),
         sigma_b=back_width(a_f, a_b, beta_f, beta_b, d_b),
     )
+
+
+def _over_lobes(value: Tensor) -> Tensor:
+    """Sum over the last dimension but one; several times faster than torch's for three lobes of a few channels."""
+    first, second, third = value.unbind(-2)
+    return first + second + third

@@ -112,15 +112,19 @@ class DualScattering:
         derivative in that share is asked for.
         """
         theta_i, theta_r, phi, n, v = self._inputs(theta_i, theta_r, phi, n, v)
-        total = theta_i.new_zeros(*torch.broadcast_shapes(theta_i.shape, self.fiber.batch_shape), self.channels)
+        batch = self.fiber.batch_shape
+        shape = torch.broadcast_shapes(theta_i.shape, batch) if batch else theta_i.shape
+        total = theta_i.new_zeros(*shape, self.channels)
         both = self.convention.share == "sum"
         whole = both or is_differentiated(v)  # a share of 0 still has a derivative
-        if whole or bool((v != 0).any()):
+        lit, unlit = whole or bool((v != 0).any()), whole or bool((v != 1).any())
+        average = None if self._no_back and not unlit else self._averages(theta_i, theta_r)
+        if lit:
             share = 1.0 if both else v.unsqueeze(-1)
-            total = total + share * self.direct(theta_i, theta_r, phi, n, phi_h=phi_h)
-        if whole or bool((v != 1).any()):
+            total = total + share * self._direct(theta_i, theta_r, phi, n, phi_h, average)
+        if unlit:
             share = 1.0 if both else (1 - v).unsqueeze(-1)
-            total = total + share * self.scatter(theta_i, theta_r, phi, n, phi_h=phi_h)
+            total = total + share * self._scatter(theta_i, theta_r, phi, n, phi_h, average)
         return total * cos_inclination(theta_i).unsqueeze(-1)
 
     def direct(
@@ -129,10 +133,16 @@ class DualScattering:
         """F_direct = f_s + d_b f_back (eq 5), `[..., C]`; n matters only where the convention widens back scattering
         always.
         """
+        average = None if self._no_back else self._averages(theta_i, theta_r)
+        return self._direct(theta_i, theta_r, phi, n, phi_h, average)
+
+    def _direct(
+        self, theta_i: Tensor, theta_r: Tensor, phi: Tensor, n: Any, phi_h: Tensor | None, average: Averages | None
+    ) -> Tensor:
+        """F_direct with averages that are known already; they matter to back scattering alone."""
         value = self.single(theta_i, theta_r, phi, phi_h=phi_h)
-        if self._no_back:
+        if self._no_back or average is None:
             return value
-        average = self.averages(self._average_angle(theta_i, theta_r))
         widened = self.convention.back_width == "always"
         extra = self._variance_f(average, n, theta_i) if widened else torch.zeros_like(average.a_f)
         return value + self.d_b.to(value.dtype) * self._back(theta_i, theta_r, phi, average, extra)
@@ -141,7 +151,13 @@ class DualScattering:
         """F_scatter = T_f (f_s^G + d_b f_back) (eqs 8, 9), `[..., C]`, with T_f = d_f a_f^n (eq 32); not yet
         multiplied by 1 - v.
         """
-        average = self.averages(self._average_angle(theta_i, theta_r))
+        return self._scatter(theta_i, theta_r, phi, n, phi_h, self._averages(theta_i, theta_r))
+
+    def _scatter(
+        self, theta_i: Tensor, theta_r: Tensor, phi: Tensor, n: Any, phi_h: Tensor | None, average: Averages | None
+    ) -> Tensor:
+        """F_scatter with averages that are known already."""
+        assert average is not None
         variance_f = self._variance_f(average, n, theta_i)
         value = self.single_scattered(theta_i, theta_r, phi, variance_f, phi_h=phi_h)
         if not self._no_back:
@@ -235,7 +251,7 @@ class DualScattering:
         """f_back = 2 c_M A_b g(theta_h - Delta_b; sqrt(sigma_b^2 + sigma_f^2)) / (pi cos^2 theta_diff) (eq 7), `[...,
         C]`.
         """
-        average = self.averages(self._average_angle(theta_i, theta_r))
+        average = self._averages(theta_i, theta_r)
         return self._back(theta_i, theta_r, phi, average, variance_f + torch.zeros_like(average.a_f))
 
     def _back(self, theta_i: Tensor, theta_r: Tensor, phi: Tensor, average: Averages, variance_f: Tensor) -> Tensor:
@@ -269,6 +285,9 @@ class DualScattering:
 
     def _average_angle(self, theta_i: Tensor, theta_r: Tensor) -> Tensor:
         return theta_i if self.convention.average_angle == "theta_in" else theta_diff(theta_i, theta_r)
+
+    def _averages(self, theta_i: Tensor, theta_r: Tensor) -> Averages:
+        return self.averages(self._average_angle(theta_i, theta_r))
 
     @property
     def _no_back(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, fields
 from typing import Any
@@ -139,7 +140,7 @@ class Fiber:
         """Number of absorption channels C."""
         return self.sigma_a.shape[-1]
 
-    @property
+    @functools.cached_property
     def batch_shape(self) -> torch.Size:
         """Shape of the fibre batch."""
         shapes = [getattr(self, name).shape for name in _DEFAULTS if name not in ("sigma_a", "alpha", "beta")]

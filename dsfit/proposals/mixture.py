@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-from dsfit.arguments import check_uniforms
+from dsfit.arguments import check_directions, check_uniforms, checked
 from dsfit.context import Context
 from dsfit.errors import InputError, as_number, as_real, check_range
 from dsfit.proposals.base import Distribution, Proposal
@@ -44,7 +44,9 @@ class MixtureDistribution(Distribution):
 
     def component_log_probs(self, omega: Tensor) -> Tensor:
         """log p_k `[..., K]` of every component."""
-        return torch.stack(torch.broadcast_tensors(*(c.log_prob(omega) for c in self.components)), dim=-1)
+        with checked(check_directions(omega, self.batch_shape)):
+            parts = [component.log_prob(omega) for component in self.components]
+        return torch.stack(torch.broadcast_tensors(*parts), dim=-1)
 
     def log_prob(self, omega: Tensor) -> Tensor:
         return log_sum_exp(self.component_log_probs(omega) + self.log_weights)
@@ -58,25 +60,23 @@ class MixtureDistribution(Distribution):
         u = check_uniforms(u, self.dimension, self.batch_shape)
         choice = self.selected(u[..., 0])
         try:
-            # Under vmap sizes cannot depend on data.
-            where = [torch.nonzero((choice == k).flatten())[:, 0] for k in range(len(self.components))]
-        except RuntimeError:
+            empty = not bool((choice.flatten()[:1] >= 0).any())
+        except RuntimeError:  # under vmap sizes cannot depend on data
+            empty = True
+        if empty:
             return self._sample_everywhere(u, choice)
-        if not choice.numel():
-            return self._sample_everywhere(u, choice)
+        counts = torch.bincount(choice.flatten(), minlength=len(self.components)).tolist()
         flat = u.reshape(-1, u.shape[-1])
-        whole: dict[int, Tensor] = {}
+        where = {k: torch.nonzero((choice == k).flatten())[:, 0] for k, count in enumerate(counts) if count}
         parts = []
-        for k, (component, index) in enumerate(zip(self.components, where, strict=True)):
-            if len(index) == 0:
-                continue
+        for k, index in where.items():
+            component = self.components[k]
             restricted = self._restrict(component, index)
             if restricted is None:
-                whole[k] = component.sample(u[..., 1 : 1 + component.dimension])
-                parts.append(whole[k].reshape(-1, 2)[index])
+                parts.append(component.sample(u[..., 1 : 1 + component.dimension]).reshape(-1, 2)[index])
             else:
                 parts.append(restricted.sample(flat[index, 1 : 1 + component.dimension]))
-        order = torch.cat(where)
+        order = torch.cat(list(where.values()))
         back = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
         return torch.cat(parts)[back].reshape(*choice.shape, 2)
 
@@ -85,7 +85,16 @@ class MixtureDistribution(Distribution):
         if len(self.batch_shape) == 0:
             return component
         element = index % self.batch_shape.numel()  # context dimensions are the last ones
-        return component.select(lambda t: t if t.dim() == 0 else t.expand(self.batch_shape).reshape(-1)[element])
+        taken: dict[int, tuple[Tensor, Tensor]] = {}  # fields of a component share tensors; kept, so that ids stay
+
+        def take(tensor: Tensor) -> Tensor:
+            if tensor.dim() == 0:
+                return tensor
+            if id(tensor) not in taken:
+                taken[id(tensor)] = tensor, tensor.expand(self.batch_shape).reshape(-1)[element]
+            return taken[id(tensor)][1]
+
+        return component.select(take)
 
     def _sample_everywhere(self, u: Tensor, choice: Tensor) -> Tensor:
         drawn = [c.sample(u[..., 1 : 1 + c.dimension]) for c in self.components]

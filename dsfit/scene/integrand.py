@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from dsfit.arguments import check_directions
+from dsfit.arguments import check_directions, checked
 from dsfit.bsdf.azimuthal import support_edges
 from dsfit.bsdf.breaks import theta_breaks
 from dsfit.bsdf.dual_scattering import DualScattering
@@ -55,10 +55,12 @@ class Integrand:
     def __call__(self, omega_i: Tensor, context: Context) -> Tensor:
         check_directions(omega_i, context.batch_shape, "omega_i")
         theta_i, phi_i = omega_i.unbind(-1)
-        n, v = self.scattering(omega_i, context)
+        with checked(omega_i):
+            n, v = self.scattering(omega_i, context)
+            radiance = self.light(omega_i)
         phi = wrap(context.phi_r - phi_i)
         value = self.bsdf(theta_i, context.theta_r, phi, n, v, phi_h=self._phi_h(context, phi))
-        return value * self.light(omega_i)
+        return value * radiance
 
     def _phi_h(self, context: Context, phi: Tensor) -> Tensor | None:
         """phi_h = (phi_i + phi_r)/2 with phi_i = phi_r - phi; None for a round fibre, which does not ask."""
