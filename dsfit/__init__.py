@@ -12,8 +12,11 @@ from typing import Any
 __version__ = "0.1.0"
 
 _PUBLIC = {
+    "Amortised": "dsfit.fit.amortise",
+    "AmortisedProposal": "dsfit.proposals",
     "Averages": "dsfit.bsdf",
     "Context": "dsfit.context",
+    "ContextStream": "dsfit.streams",
     "Convention": "dsfit.bsdf",
     "DualScattering": "dsfit.bsdf",
     "Estimate": "dsfit.mis",
@@ -24,6 +27,7 @@ _PUBLIC = {
     "Material": "dsfit.material",
     "Nodes": "dsfit.quality",
     "StructuredProposal": "dsfit.proposals",
+    "amortise": "dsfit.fit.amortise",
     "estimate": "dsfit.mis",
     "excess": "dsfit.quality",
     "fit": "dsfit.fit",

@@ -1,6 +1,7 @@
 """Proposals: what draws an incident direction, and the density it draws with."""
 
 from dsfit.proposals.adapters import FromDensity, TorchDistribution
+from dsfit.proposals.amortised import AmortisedProposal
 from dsfit.proposals.azimuth import CosineHalf, Scattered, TruncatedGaussian, WrappedGaussian
 from dsfit.proposals.base import Azimuthal, Distribution, Longitudinal, Product, Proposal
 from dsfit.proposals.cauchy_lobe import CauchyLobe
@@ -24,6 +25,7 @@ from dsfit.proposals.uniform import (
 )
 
 __all__ = [
+    "AmortisedProposal",
     "Azimuthal",
     "BackHalf",
     "BackScatterLobe",

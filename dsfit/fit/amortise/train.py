@@ -1,0 +1,161 @@
+"""`amortise(bsdf, stream)`: one proposal for every context of a fibre."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from dataclasses import dataclass, field
+
+import torch
+
+from dsfit.bsdf.dual_scattering import DualScattering
+from dsfit.context import Context
+from dsfit.errors import InputError, as_number
+from dsfit.fit.amortise.excess import all_excesses, excess_at
+from dsfit.fit.amortise.targets import Targets, make_targets
+from dsfit.proposals.amortised import AmortisedProposal
+from dsfit.streams import ContextStream
+
+TRAINING = ContextStream(theta="angle", rule="mixed")
+STEPS = 1000
+_RATE, _LAST_RATE, _WARM = 1e-2, 1e-5, 30
+_BATCH = 24
+
+
+@dataclass(frozen=True)
+class Progress:
+    """After so many steps and seconds of training: the objective, mean over the steps since the last entry."""
+
+    step: int
+    seconds: float
+    objective: float
+
+
+@dataclass(frozen=True)
+class Amortised:
+    """A trained proposal, and what its training took.
+
+    Attributes:
+        proposal: the trained copy, in float64, its parameters no longer learnable.
+        seconds: wall time: "proposal" (its tables), "targets" (the training contexts), "training", and "total".
+        steps: of the training.
+        contexts: number of training contexts.
+        excess: of the training contexts by their quadrature, sorted.
+        history: the objective over the training.
+    """
+
+    proposal: AmortisedProposal
+    seconds: dict[str, float]
+    steps: int
+    contexts: int
+    excess: list[float] = field(repr=False)
+    history: list[Progress] = field(repr=False)
+
+
+def amortise(
+    bsdf: DualScattering,
+    stream: ContextStream = TRAINING,
+    *,
+    seconds: float | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    hidden: tuple[int, ...] = (32, 32),
+    defensive: float = 0.001,
+    start: AmortisedProposal | None = None,
+    inclinations: int = 256,
+    pairs: int = 16,
+    scale: float = 0.01,
+) -> Amortised:
+    """Train an `AmortisedProposal` for the contexts of a stream, in a furnace.
+
+    Minimised is the mean over contexts of log(1 + excess / scale): hard contexts count, but do not drown the others.
+    The training set has `inclinations` viewing inclinations with `pairs` pairs (n, v) each, all drawn once from the
+    stream; its best densities and the azimuthal laws are computed once (`make_targets`), so that a step evaluates the
+    longitudinal lobes alone. Adam, with a rate that falls from 1e-2 to 0 as a cosine.
+
+    Args:
+        bsdf: of one round fibre. `precision="table"` makes the targets tens of times faster.
+        stream: of the training contexts. The default is uniform in theta_r, with v of every kind.
+        seconds: wall time of the training proper, without targets; then the result depends on the machine.
+        steps: number of steps, if `seconds` is not given; 1000 if neither is. Equal seeds and steps give equal
+            results on one machine.
+        seed: of the contexts, the order of the batches, and the network's first weights.
+        hidden, defensive: see `AmortisedProposal`.
+        start: a proposal of this fibre to go on from; its hidden layers and defensive share are kept.
+        inclinations, pairs: size of the training set; memory is about 0.25 MB for each inclination.
+        scale: excess below which contexts no longer count much.
+
+    Raises:
+        InputError: an eccentric fibre or a batch of fibres, both `seconds` and `steps`, or one out of range.
+    """
+    if not bsdf.fiber.is_round:
+        raise InputError("bsdf.fiber.eccentricity", bsdf.fiber.eccentricity.tolist(), "a round fibre (eccentricity 1)")
+    if seconds is not None and steps is not None:
+        raise InputError("seconds, steps", (seconds, steps), "one of them")
+    limit = math.inf if seconds is None else as_number("seconds", seconds, 0.0)
+    steps = STEPS if steps is None and seconds is None else steps
+    counts = {"inclinations": inclinations, "pairs": pairs, **({} if steps is None else {"steps": steps})}
+    for name, value in counts.items():
+        if isinstance(value, bool) or not isinstance(value, int) or value < (0 if name == "steps" else 1):
+            raise InputError(name, value, "an integer >= " + ("0" if name == "steps" else "1"))
+    scale = as_number("scale", scale, 0.0, open_low=True)
+    began = time.perf_counter()
+    if start is None:
+        proposal = AmortisedProposal(bsdf, hidden, defensive, seed=seed)
+    else:
+        proposal = copy.deepcopy(start).double().requires_grad_(True)
+    made = time.perf_counter()
+    generator = torch.Generator().manual_seed(seed)
+    targets = make_targets(bsdf, proposal, training_contexts(stream, inclinations, pairs, generator))
+    ready = time.perf_counter()
+    done, history = _train(proposal, targets, scale, steps, limit, generator)
+    ended = time.perf_counter()
+    spent = {"proposal": made - began, "targets": ready - made, "training": ended - ready, "total": ended - began}
+    excess = torch.sort(all_excesses(targets, proposal).flatten()).values.tolist()
+    return Amortised(proposal.requires_grad_(False), spent, done, inclinations * pairs, excess, history)
+
+
+def training_contexts(stream: ContextStream, inclinations: int, pairs: int, generator: torch.Generator) -> Context:
+    """Contexts `[inclinations, pairs]` of a stream that share theta_r along their rows."""
+    theta_r = stream.draw(inclinations, generator).theta_r
+    other = stream.draw(inclinations * pairs, generator)
+    order = torch.randperm(inclinations * pairs, generator=generator)
+    n, v = (x[order].reshape(inclinations, pairs) for x in (other.n, other.v))
+    return Context(theta_r[:, None], 0.0, n, v)
+
+
+def _train(
+    proposal: AmortisedProposal,
+    targets: Targets,
+    scale: float,
+    steps: int | None,
+    limit: float,
+    generator: torch.Generator,
+) -> tuple[int, list[Progress]]:
+    optimiser = torch.optim.Adam(proposal.parameters(), lr=_RATE)
+    began, done, recent = time.perf_counter(), 0, []
+    history: list[Progress] = []
+    order = torch.randperm(len(targets), generator=generator)
+    while True:
+        spent = time.perf_counter() - began
+        share = spent / limit if steps is None else done / max(steps, 1)
+        if share >= 1:
+            break
+        rate = _LAST_RATE + _RATE * 0.5 * (1 + math.cos(math.pi * share)) * min(1.0, (done + 1) / _WARM)
+        for group in optimiser.param_groups:
+            group["lr"] = rate
+        if len(order) < min(_BATCH, len(targets)):
+            order = torch.randperm(len(targets), generator=generator)
+        rows, order = order[:_BATCH], order[_BATCH:]
+        objective = torch.log1p(excess_at(targets[rows], proposal) / scale).mean()
+        optimiser.zero_grad()
+        objective.backward()
+        torch.nn.utils.clip_grad_norm_(proposal.parameters(), 1.0)
+        optimiser.step()
+        done += 1
+        recent.append(float(objective.detach()))
+        if done % 20 == 0 or done == steps:
+            history.append(Progress(done, time.perf_counter() - began, sum(recent) / len(recent)))
+            recent = []
+    return done, history
