@@ -78,6 +78,11 @@ class LobeShares:
         value = scaled * cos_inclination(theta_in)[..., None, None, None]  # never 0: averages divide by shares
         return value.select(-3, 0), value.select(-3, 1)
 
+    @property
+    def series(self) -> PiecewiseChebyshev:
+        """The shares over cos(theta_in), 2 x 3 x C components: forward and backward, lobes, channels."""
+        return self._shares
+
     def _jumps(self) -> Tensor:
         """theta_diff where eta' = 2 or eta' = sqrt 2 (or, for a hard split, where the edge of TRT crosses +-pi/2) for a
         principal orientation of the section.

@@ -4,7 +4,6 @@ equations (4)-(12), (32), (37).
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from typing import Any
@@ -14,8 +13,9 @@ from torch import Tensor
 
 from dsfit.arguments import all_finite, check_inside
 from dsfit.bsdf import longitudinal
-from dsfit.bsdf.averages import Averages, LobeShares, averages_from_shares
+from dsfit.bsdf.averages import Averages
 from dsfit.bsdf.azimuthal import (
+    ALL_LOBES,
     AZIMUTHAL_MODELS,
     azimuthal,
     azimuthal_constant,
@@ -24,14 +24,17 @@ from dsfit.bsdf.azimuthal import (
 )
 from dsfit.bsdf.conventions import Convention
 from dsfit.bsdf.fiber import Fiber
+from dsfit.bsdf.fiber_averages import FiberAverages
+from dsfit.bsdf.grey import first_channel, one_channel
 from dsfit.bsdf.scattered import simplified_windows
 from dsfit.bsdf.tables import AzimuthTable
+from dsfit.bsdf.terms import Terms
 from dsfit.errors import InputError, as_real, check_broadcast, check_choice, check_finite, check_range, common_dtype
 from dsfit.frame import HALF_PI, cos_inclination, theta_diff, theta_half, wrap
 from dsfit.special import is_differentiated, log_gauss
 
 
-class DualScattering:
+class DualScattering(FiberAverages):
     """The dual scattering BSDF of one fibre (or a batch of fibres).
 
     Args:
@@ -43,6 +46,8 @@ class DualScattering:
         precision: "exact" (1e-9) or "table": N^G from a spline of its exact values, tens of times faster, within 2e-3
             of each lobe's largest value (1e-5 for R and TT) and 1e-5 in integrals. The table holds no gradients for
             the fibre, serves one round fibre, and not the `raw` azimuths, whose N^G has square-root edges.
+        terms: which terms of F are computed; all, if left out. `azimuthal`, `azimuthal_scattered` and `averages` give
+            every lobe whatever the terms.
 
     All angles are radians, all results `[..., C]` in the dtype of the angles; the fibre is brought to that dtype.
     Everything is differentiable in the angles, n, v, and the fibre's fields. Directions broadcast with the fibre's
@@ -51,8 +56,9 @@ class DualScattering:
     `phi_h = (phi_i + phi_r)/2` matters to eccentric fibres only.
 
     Raises:
-        InputError: d_f or d_b outside [0, 1], unknown azimuthal model, convention or precision, or a table asked of a
-            batch of fibres, of an eccentric fibre, of one that requires gradients, or of `raw` azimuths.
+        InputError: d_f or d_b outside [0, 1], unknown azimuthal model, convention or precision, a table asked of a
+            batch of fibres, of an eccentric fibre, of one that requires gradients, or of `raw` azimuths, or grey terms
+            of a fibre that is not grey.
     """
 
     def __init__(
@@ -63,37 +69,44 @@ class DualScattering:
         azimuthal: str = "marschner",
         convention: str | Convention = "consistent",
         precision: str = "exact",
+        terms: Terms | None = None,
     ) -> None:
         if not isinstance(fiber, Fiber):
             raise InputError("fiber", type(fiber).__name__, "a dsfit Fiber")
-        self.fiber = fiber
-        self.d_f = check_range("d_f", as_real("d_f", d_f, fiber.dtype), 0.0, 1.0)
-        self.d_b = check_range("d_b", as_real("d_b", d_b, fiber.dtype), 0.0, 1.0)
-        if self.d_f.ndim or self.d_b.ndim:
-            raise InputError("d_f, d_b", (tuple(self.d_f.shape), tuple(self.d_b.shape)), "single numbers")
+        d_f, d_b = (check_range(k, as_real(k, x, fiber.dtype), 0.0, 1.0) for k, x in (("d_f", d_f), ("d_b", d_b)))
+        if d_f.ndim or d_b.ndim:
+            raise InputError("d_f, d_b", (tuple(d_f.shape), tuple(d_b.shape)), "single numbers")
         self.model = check_choice("azimuthal", azimuthal, AZIMUTHAL_MODELS)
-        self.convention = Convention.named(convention)
+        super().__init__(fiber, d_b, Convention.named(convention))
+        self.d_f = d_f
         self.precision = check_choice("precision", precision, ("exact", "table"))
         single = not fiber.batch_shape and not fiber.requires_grad and fiber.is_round
         if precision == "table" and not (single and azimuthal != "raw"):
             allowed = "'exact' for raw azimuths, for a batch of fibres, an eccentric fibre, or one with gradients"
             raise InputError("precision", precision, allowed)
-        self._fibers = {fiber.dtype: fiber}
-
-    @property
-    def channels(self) -> int:
-        """Number of channels C."""
-        return self.fiber.channels
+        if terms is not None and not isinstance(terms, Terms):
+            raise InputError("terms", type(terms).__name__, "dsfit Terms")
+        self.terms = Terms() if terms is None else terms
+        self._selected: dict[tuple[int, ...], AzimuthTable] = {}
+        self._grey = None
+        if self.terms.grey and fiber.channels > 1:
+            self._grey = self.replace(fiber=first_channel(fiber))
 
     def replace(self, **changes: Any) -> DualScattering:
         """The same BSDF with some constructor arguments replaced."""
         arguments: dict[str, Any] = {
             "fiber": self.fiber, "d_f": self.d_f, "d_b": self.d_b, "azimuthal": self.model, "convention":
             self.convention,
-            "precision": self.precision,
+            "precision": self.precision, "terms": self.terms,
         }  # fmt: skip
-        return DualScattering(**{**arguments, **changes})
+        other = DualScattering(**{**arguments, **changes})
+        if set(changes) == {"terms"}:  # tables do not depend on them
+            for name in ("_cached_shares", "_cached_batch", "scattered_table"):
+                if name in self.__dict__:
+                    other.__dict__[name] = self.__dict__[name]
+        return other
 
+    @one_channel
     def __call__(
         self, theta_i: Tensor, theta_r: Tensor, phi: Tensor, n: Any = 0.0, v: Any = None, *, phi_h: Tensor | None = None
     ) -> Tensor:
@@ -117,8 +130,9 @@ class DualScattering:
         total = theta_i.new_zeros(*shape, self.channels)
         both = self.convention.share == "sum"
         whole = both or is_differentiated(v)  # a share of 0 still has a derivative
-        lit, unlit = whole or bool((v != 0).any()), whole or bool((v != 1).any())
-        average = None if self._no_back and not unlit else self._averages(theta_i, theta_r)
+        lit = bool(self.terms.direct) and (whole or bool((v != 0).any()))
+        unlit = bool(self.terms.scattered) and (whole or bool((v != 1).any()))
+        average = self._averages(theta_i, theta_r) if unlit or (lit and self._backs("direct")) else None
         if lit:
             share = 1.0 if both else v.unsqueeze(-1)
             total = total + share * self._direct(theta_i, theta_r, phi, n, phi_h, average)
@@ -127,13 +141,14 @@ class DualScattering:
             total = total + share * self._scatter(theta_i, theta_r, phi, n, phi_h, average)
         return total * cos_inclination(theta_i).unsqueeze(-1)
 
+    @one_channel
     def direct(
         self, theta_i: Tensor, theta_r: Tensor, phi: Tensor, n: Any = 0.0, *, phi_h: Tensor | None = None
     ) -> Tensor:
         """F_direct = f_s + d_b f_back (eq 5), `[..., C]`; n matters only where the convention widens back scattering
         always.
         """
-        average = None if self._no_back else self._averages(theta_i, theta_r)
+        average = self._averages(theta_i, theta_r) if self._backs("direct") else None
         return self._direct(theta_i, theta_r, phi, n, phi_h, average)
 
     def _direct(
@@ -141,12 +156,13 @@ class DualScattering:
     ) -> Tensor:
         """F_direct with averages that are known already; they matter to back scattering alone."""
         value = self.single(theta_i, theta_r, phi, phi_h=phi_h)
-        if self._no_back or average is None:
+        if average is None or not self._backs("direct"):
             return value
         widened = self.convention.back_width == "always"
         extra = self._variance_f(average, n, theta_i) if widened else torch.zeros_like(average.a_f)
         return value + self.d_b.to(value.dtype) * self._back(theta_i, theta_r, phi, average, extra)
 
+    @one_channel
     def scatter(self, theta_i: Tensor, theta_r: Tensor, phi: Tensor, n: Any, *, phi_h: Tensor | None = None) -> Tensor:
         """F_scatter = T_f (f_s^G + d_b f_back) (eqs 8, 9), `[..., C]`, with T_f = d_f a_f^n (eq 32); not yet
         multiplied by 1 - v.
@@ -160,93 +176,87 @@ class DualScattering:
         assert average is not None
         variance_f = self._variance_f(average, n, theta_i)
         value = self.single_scattered(theta_i, theta_r, phi, variance_f, phi_h=phi_h)
-        if not self._no_back:
+        if self._backs("scattered"):
             factor = math.pi if self.convention.back_factor == "pi" else 1.0
             back = self._back(theta_i, theta_r, phi, average, variance_f)
             value = value + factor * self.d_b.to(value.dtype) * back
         n = torch.as_tensor(n, dtype=theta_i.dtype, device=theta_i.device)
         return value * self._transmittance(average, n) * self.d_f.to(value.dtype) ** (self.convention.density_power - 1)
 
+    @one_channel
     def single(self, theta_i: Tensor, theta_r: Tensor, phi: Tensor, *, phi_h: Tensor | None = None) -> Tensor:
         """f_s = c_M sum_p M_p N_p / cos^2(theta_diff) (eq 6), `[..., C]`, per steradian."""
-        diff = theta_diff(theta_i, theta_r)
-        shape = longitudinal.lobes(self._fiber(theta_i.dtype), theta_half(theta_i, theta_r)).unsqueeze(-1)
-        return (shape * self.azimuthal(diff, phi, phi_h=phi_h)).sum(-2) * self._projection(diff)
+        diff, lobes = theta_diff(theta_i, theta_r), self.terms.direct_lobes
+        if not lobes:
+            return self._nothing(diff)
+        shape = longitudinal.lobes(self._fiber(theta_i.dtype), theta_half(theta_i, theta_r), lobes).unsqueeze(-1)
+        value = self.azimuthal(diff, phi, phi_h=phi_h, **_chosen(lobes))
+        return (shape * value).sum(-2) * self._projection(diff)
 
+    @one_channel
     def single_scattered(
         self, theta_i: Tensor, theta_r: Tensor, phi: Tensor, variance_f: Tensor, *, phi_h: Tensor | None = None
     ) -> Tensor:
         """f_s^G = c_M sum_p M^G_p N^G_p / cos^2(theta_diff) (eq 9), `[..., C]`, for sigma_f^2 `[..., C]`."""
-        diff = theta_diff(theta_i, theta_r)
-        shape = longitudinal.scattered_lobes(self._fiber(theta_i.dtype), theta_half(theta_i, theta_r), variance_f)
-        return (shape * self.azimuthal_scattered(diff, phi, phi_h=phi_h)).sum(-2) * self._projection(diff)
+        diff, lobes = theta_diff(theta_i, theta_r), self.terms.scattered_lobes
+        if not lobes:
+            return self._nothing(diff)
+        fiber = self._fiber(theta_i.dtype)
+        shape = longitudinal.scattered_lobes(fiber, theta_half(theta_i, theta_r), variance_f, lobes)
+        value = self.azimuthal_scattered(diff, phi, phi_h=phi_h, **_chosen(lobes))
+        return (shape * value).sum(-2) * self._projection(diff)
 
-    def azimuthal(self, theta_diff: Tensor, phi: Tensor, *, phi_h: Tensor | None = None) -> Tensor:
-        """N_R, N_TT, N_TRT at theta_diff and relative azimuth phi, `[..., 3, C]`, per radian."""
+    @one_channel
+    def azimuthal(
+        self, theta_diff: Tensor, phi: Tensor, *, phi_h: Tensor | None = None, lobes: tuple[int, ...] = ALL_LOBES
+    ) -> Tensor:
+        """N_R, N_TT, N_TRT (those of `lobes`, 0 to 2) at theta_diff and relative azimuth phi, `[..., len(lobes), C]`,
+        per radian.
+        """
         fiber = self._fiber(phi.dtype)
         if self._printed_shapes:
-            shape = printed_shapes(fiber, wrap(phi).abs() + 0 * theta_diff)
+            shape = printed_shapes(fiber, wrap(phi).abs() + 0 * theta_diff)[..., list(lobes)]
             return shape.unsqueeze(-1).expand(*shape.shape, self.channels)
-        return azimuthal(fiber, theta_diff, phi, phi_h, self.model, self.convention.absorption)
+        return azimuthal(fiber, theta_diff, phi, phi_h, self._azimuths, self.convention.absorption, lobes)
 
-    def azimuthal_scattered(self, theta_diff: Tensor, phi: Tensor, *, phi_h: Tensor | None = None) -> Tensor:
-        """N^G_R, N^G_TT, N^G_TRT, `[..., 3, C]`, per radian (eq 11): N averaged over an incident half circle."""
+    @one_channel
+    def azimuthal_scattered(
+        self, theta_diff: Tensor, phi: Tensor, *, phi_h: Tensor | None = None, lobes: tuple[int, ...] = ALL_LOBES
+    ) -> Tensor:
+        """N^G_R, N^G_TT, N^G_TRT (those of `lobes`), `[..., len(lobes), C]`, per radian (eq 11): N averaged over an
+        incident half circle.
+        """
         fiber, constant = self._fiber(phi.dtype), self.convention.scattered_azimuth == "constant"
         angle = torch.zeros_like(phi) if constant else wrap(phi).abs()
         if self._printed_shapes:
             factor = torch.tensor([4.0, 1.0, 4.0], dtype=phi.dtype, device=phi.device) / math.pi
-            shape = simplified_windows(fiber, angle + 0 * theta_diff) * factor
+            shape = (simplified_windows(fiber, angle + 0 * theta_diff) * factor)[..., list(lobes)]
             return shape.unsqueeze(-1).expand(*shape.shape, self.channels)
         if constant:
             theta_diff, _ = torch.broadcast_tensors(theta_diff, phi)
-            return azimuthal_constant(fiber, theta_diff, phi_h, self.model, self.convention.absorption)
+            return azimuthal_constant(fiber, theta_diff, phi_h, self._azimuths, self.convention.absorption, lobes)
         if self.precision == "table":
-            return self._scattered_table(theta_diff, angle)
-        return azimuthal_scattered(fiber, theta_diff, angle, phi_h, self.model, self.convention.absorption)
+            return self._table_of(lobes)(theta_diff, angle)
+        return azimuthal_scattered(fiber, theta_diff, angle, phi_h, self._azimuths, self.convention.absorption, lobes)
 
     @functools.cached_property
-    def _scattered_table(self) -> AzimuthTable:
+    def scattered_table(self) -> AzimuthTable:
+        """N^G as `precision="table"` has it, whatever the terms."""
         fiber, absorption = self._fiber(torch.float64), self.convention.absorption
         return AzimuthTable(lambda diff, phi: azimuthal_scattered(fiber, diff, phi, None, self.model, absorption))
 
-    def averages(self, theta_in: Tensor) -> Averages:
-        """a_f, a_b, alpha, beta, A_b, Delta_b, sigma_b at inclination theta_in, each `[..., C]` (Zinke et al. 2008,
-        eqs 6, 12-17).
+    def _table_of(self, lobes: tuple[int, ...]) -> AzimuthTable:
+        if lobes not in self._selected:
+            self._selected[lobes] = self.scattered_table.select(lobes)
+        return self._selected[lobes]
 
-        From raw attenuation integrals over offsets, whatever the azimuthal model: the averages count energy, which
-            the treatment of the
-        caustic only moves.
-        """
-        fiber, dtype = self._fiber(torch.float64), theta_in.dtype
-        front, back = self.lobe_shares(theta_in.to(torch.float64))  # 1 - a_f^2 cancels: round at the end
-        average = averages_from_shares(fiber, self.convention, front, back, self.d_b.to(torch.float64))
-        return Averages(*(getattr(average, field.name).to(dtype) for field in dataclasses.fields(Averages)))
-
-    def lobe_shares(self, theta_in: Tensor) -> tuple[Tensor, Tensor]:
-        """Forward and backward shares a_f^p, a_b^p of R, TT, TRT at theta_in, each `[..., 3, C]`; a_f and a_b are
-        their sums.
-        """
-        fiber, dtype = self._fiber(torch.float64), theta_in.dtype
-        theta_in = theta_in.to(torch.float64)  # panels next to grazing are narrower than float32 can tell
-        if not fiber.batch_shape:
-            return tuple(x.to(dtype) for x in self._shares(theta_in))  # type: ignore[return-value]
-        shape = torch.broadcast_shapes(theta_in.shape, fiber.batch_shape)
-        which = torch.arange(math.prod(fiber.batch_shape)).reshape(fiber.batch_shape).expand(shape)
-        theta = theta_in.expand(shape)
-        parts = []
-        for half in range(2):
-            value = theta.new_zeros(*shape, 3, self.channels)
-            for k, table in enumerate(self._shares_of_batch):
-                here = which == k
-                value = value.index_put((here,), table(theta[here])[half])
-            parts.append(value.to(dtype))
-        return parts[0], parts[1]
-
+    @one_channel
     def transmittance(self, theta_in: Tensor, n: Tensor) -> Tensor:
         """T_f(n, theta_in) = d_f a_f(theta_in)^n (eq 32), `[..., C]`; right for n = 0 and for huge n."""
         n = torch.as_tensor(n, dtype=theta_in.dtype, device=theta_in.device)
         return self._transmittance(self.averages(theta_in), n)
 
+    @one_channel
     def back_scattering(self, theta_i: Tensor, theta_r: Tensor, phi: Tensor, variance_f: Any = 0.0) -> Tensor:
         """f_back = 2 c_M A_b g(theta_h - Delta_b; sqrt(sigma_b^2 + sigma_f^2)) / (pi cos^2 theta_diff) (eq 7), `[...,
         C]`.
@@ -289,10 +299,20 @@ class DualScattering:
     def _averages(self, theta_i: Tensor, theta_r: Tensor) -> Averages:
         return self.averages(self._average_angle(theta_i, theta_r))
 
+    def _backs(self, half: str) -> bool:
+        """Whether F_direct or F_scatter has back scattering: not if it is left out, or multiplied by a zero that nobody
+        asks a derivative of."""
+        nothing = bool(self.d_b == 0) and not is_differentiated(self.d_b)
+        return "back" in getattr(self.terms, half) and not nothing
+
+    def _nothing(self, like: Tensor) -> Tensor:
+        batch = self.fiber.batch_shape
+        return like.new_zeros(*torch.broadcast_shapes(like.shape, batch), self.channels)
+
     @property
-    def _no_back(self) -> bool:
-        """Whether back scattering is multiplied by a zero that nobody asks a derivative of."""
-        return bool(self.d_b == 0) and not is_differentiated(self.d_b)
+    def _azimuths(self) -> str:
+        """The azimuthal model, raw where the terms leave the treatment of the caustic out."""
+        return "raw" if self.model == "marschner" and not self.terms.glint else self.model
 
     @property
     def _printed_shapes(self) -> bool:
@@ -312,40 +332,6 @@ class DualScattering:
         check_inside("v", values["v"], 0.0, 1.0)
         return torch.broadcast_tensors(*values.values())
 
-    def _fiber(self, dtype: torch.dtype) -> Fiber:
-        if dtype not in self._fibers:
-            self._fibers[dtype] = self.fiber.to(dtype)
-        return self._fibers[dtype]
 
-    def _tables(self, fiber: Fiber) -> LobeShares:
-        return LobeShares(fiber, self.convention)
-
-    @property
-    def _shares(self) -> LobeShares:
-        if self.fiber.requires_grad:  # a graph serves one backward pass
-            return self._tables(self._fiber(torch.float64))
-        return self._cached_shares
-
-    @functools.cached_property
-    def _cached_shares(self) -> LobeShares:
-        return self._tables(self._fiber(torch.float64))
-
-    @property
-    def _shares_of_batch(self) -> list[LobeShares]:
-        if self.fiber.requires_grad:
-            return self._build_batch()
-        return self._cached_batch
-
-    @functools.cached_property
-    def _cached_batch(self) -> list[LobeShares]:
-        return self._build_batch()
-
-    def _build_batch(self) -> list[LobeShares]:
-        fiber, shape = self._fiber(torch.float64), self.fiber.batch_shape
-        rows = {
-            name: value.expand(*shape, *value.shape[-1:]).reshape(-1, value.shape[-1])
-            if name in ("sigma_a", "alpha", "beta")
-            else value.expand(shape).reshape(-1)
-            for name, value in fiber.parameters().items()
-        }
-        return [self._tables(Fiber(**{k: x[i] for k, x in rows.items()})) for i in range(math.prod(shape))]
+def _chosen(lobes: tuple[int, ...]) -> dict[str, Any]:
+    return {} if lobes == ALL_LOBES else {"lobes": lobes}
