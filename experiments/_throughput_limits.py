@@ -1,0 +1,72 @@
+"""What binds a kernel: its counts per direction, and where its time goes by torch's profiler."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from _throughput_counts import counted, least_bytes
+from torch import Tensor
+from torch.profiler import ProfilerActivity, profile
+
+from dsfit.streams import ContextStream
+
+_SAMPLES, _BATCH = 16, 256
+_MOST = 8
+
+
+def counts(library: Any) -> dict[str, dict[str, float]]:
+    """Counts per direction (per context for `prepare`) of every task, from the eager kernel; the compiled one computes
+    the same formulas. `least bytes` are those of the arguments and results, each once."""
+    kernel = library.kernels["kernel, eager"]
+    found = {}
+    for task, (run, inputs, directions) in _tasks(kernel).items():
+        outputs = run()
+        found[task] = counted(run, directions)
+        results = outputs if isinstance(outputs, tuple) else (outputs,)
+        tensors = tuple(x for x in results if isinstance(x, Tensor))
+        found[task]["least bytes"] = least_bytes(inputs, tensors, directions)
+    return found
+
+
+def _tasks(kernel: Any) -> dict[str, tuple[Callable[[], Any], tuple[Tensor, ...], int]]:
+    generator = torch.Generator().manual_seed(1)
+    drawn = ContextStream().draw(_BATCH, generator)
+    fields = tuple(x.float().contiguous() for x in (drawn.theta_r, drawn.n, drawn.v))
+    u = torch.rand(_SAMPLES, _BATCH, 3, generator=generator).clamp(1e-6, 1 - 1e-6)
+    with torch.no_grad():
+        contexts = kernel.prepare(*fields)
+        directions = tuple(x.contiguous() for x in kernel.sample(contexts, u))
+    count = _SAMPLES * _BATCH
+    return {
+        "prepare": (lambda: kernel.prepare(*fields), fields, _BATCH),
+        "eval": (lambda: kernel.eval(contexts, *directions), directions, count),
+        "log_prob": (lambda: kernel.log_prob(contexts, *directions), directions, count),
+        "sample": (lambda: kernel.sample(contexts, u), (u,), count),
+        "fused": (lambda: kernel.sample_eval(contexts, u), (u,), count),
+    }
+
+
+def profiles(library: Any) -> dict[str, list[dict[str, Any]]]:
+    """The operations with most time of their own, by kernel and task, as shares of the whole."""
+    found = {}
+    for name, kernel in library.kernels.items():
+        for task, (run, _, _) in _tasks(kernel).items():
+            if task in ("eval", "fused"):
+                found[f"{name}, {task}"] = _profile(run)
+    return found
+
+
+def _profile(run: Callable[[], Any], calls: int = 20) -> list[dict[str, Any]]:
+    with torch.no_grad():
+        run()
+        with profile(activities=[ProfilerActivity.CPU]) as recorded:
+            for _ in range(calls):
+                run()
+    events = sorted(recorded.key_averages(), key=lambda event: -event.self_cpu_time_total)
+    total = sum(event.self_cpu_time_total for event in events)
+    return [
+        {"name": event.key[:80], "share": event.self_cpu_time_total / total, "calls": event.count / calls}
+        for event in events[:_MOST]
+    ]
