@@ -1,4 +1,5 @@
-"""The command line: `dsfit run CONFIG`, `dsfit check CONFIG`, `dsfit show RUNDIR`, `dsfit presets`.
+"""The command line: `dsfit run CONFIG`, `dsfit check CONFIG`, `dsfit bench CONFIG`, `dsfit show RUNDIR`, `dsfit
+presets`.
 
 Exit codes: 0 done, 1 the run failed (what is done is kept), 2 the config or an argument is wrong (nothing was
 written), 3 a check was not passed, 130 interrupted.
@@ -37,7 +38,7 @@ Changes = Annotated[
 Out = Annotated[Path | None, typer.Option(help="Folder for run directories, instead of output.dir.")]
 Force = Annotated[bool, typer.Option("--force", help="Compute anew what an earlier run left.")]
 Workers = Annotated[
-    int | None, typer.Option(min=0, help="Processes; default: the number of cores. 0: none but this one.")
+    int | None, typer.Option(min=0, help="Processes; default: the number of cores, 1 for a race. 0: none but this one.")
 ]
 
 
@@ -68,6 +69,19 @@ def check(
         changes.append("check.suites=[" + ", ".join(f'"{name}"' for name in suite) + "]")
     result = _run(config, changes, out, force, workers)
     if result["report"]["verdict"] != "pass":
+        raise typer.Exit(3)
+
+
+@app.command()
+def bench(
+    config: Config, set_: Changes = None, out: Out = None, force: Force = False, workers: Workers = None
+) -> None:
+    """Race peers: error against run time over a stream of contexts and at single ones, as the config's [race] says.
+    Exits with 3 if a peer's estimates are off the truth."""
+    from dsfit.experiment.race import failed
+
+    result = _run(config, [*(set_ or []), 'kind="race"'], out, force, workers)
+    if failed(result):
         raise typer.Exit(3)
 
 

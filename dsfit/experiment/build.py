@@ -177,3 +177,7 @@ def check(raw: RawConfig, config: Config) -> None:
         from dsfit.experiment.checking import validate
 
         validate(raw, config)
+    if config.kind == "race":
+        from dsfit.experiment.race import check as check_race
+
+        check_race(raw, config)

@@ -15,7 +15,8 @@ from dsfit.experiment.validation import Experiment
 
 @dataclass(frozen=True)
 class Job:
-    """One cell: a context of a grid point, a whole grid point for `transmittance`, a suite's part for `check`.
+    """One cell: a context of a grid point, a whole grid point for `transmittance`, a suite's part for `check`, a peer
+    over one group of contexts for `race`.
 
     Attributes:
         index: position in the run.
@@ -41,6 +42,13 @@ def jobs(experiment: Experiment) -> list[Job]:
                 identity = {"grid": point.values, **work}
                 found.append(Job(len(found), _label(point.config, identity), identity, point.config))
             continue
+        if experiment.config.kind == "race":
+            from dsfit.experiment.race import work_of as races_of
+
+            for work in races_of(point.config):
+                identity = {"grid": point.values, **work}
+                found.append(Job(len(found), _label(point.config, identity), identity, point.config))
+            continue
         values = list(build.context_values(point.config.contexts))
         for context in [{}] if experiment.config.kind == "transmittance" else values:
             identity = {"grid": point.values, "context": context}
@@ -54,6 +62,8 @@ _SHOWN_ANYWAY = ("fiber.preset", "contexts.theta_r_deg", "contexts.phi_r_deg", "
 def _label(config: Config, identity: dict[str, Any]) -> str:
     if identity.get("part"):
         return f"{identity['suite']}: {identity['part']}"
+    if identity.get("peer"):
+        return f"{identity['peer']}: {identity['group']}"
     parts = [config.fiber.preset]
     parts += [f"{key.split('.')[-1]} {value}" for key, value in identity["grid"].items() if key not in _SHOWN_ANYWAY]
     context = identity["context"]
@@ -79,6 +89,10 @@ def run_job(directory: RunDirectory, job: Job, say: Callable[[str], None]) -> No
         from dsfit.experiment.checking import run_suite
 
         data, arrays = run_suite(job.config, job.identity, job.label, say)
+    elif job.config.kind == "race":
+        from dsfit.experiment.race import race
+
+        data, arrays = race(job.config, job.identity, directory, say)
     else:
         from dsfit.experiment.compare import compare
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from dsfit.experiment.check_schema import CheckConfig
+from dsfit.experiment.schema_race import RaceConfig
 from dsfit.experiment.sections import Section
 
 SCHEMA_VERSION = 1
@@ -233,7 +234,7 @@ class Config(Section):
     """A whole experiment."""
 
     title: Annotated[str, Field(max_length=200)] = ""
-    kind: Literal["compare", "sweep", "transmittance", "check"] = "compare"
+    kind: Literal["compare", "sweep", "transmittance", "check", "race"] = "compare"
     fiber: FiberConfig = FiberConfig()
     bsdf: BsdfConfig = BsdfConfig()
     light: LightConfig = ConstantLight()
@@ -245,3 +246,4 @@ class Config(Section):
     sweep: SweepConfig = SweepConfig()
     transmittance: TransmittanceConfig = TransmittanceConfig()
     check: CheckConfig = CheckConfig()
+    race: RaceConfig = RaceConfig()

@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import RenderableType
 from rich.table import Table
 
-from dsfit.experiment import check_report
+from dsfit.experiment import check_report, race_report
 from dsfit.experiment.files import number
 
 
@@ -144,6 +144,8 @@ def terminal_table(result: dict[str, Any]) -> RenderableType:
     """The summary as a rich table."""
     if result["kind"] == "check":
         return check_report.terminal_table(result)
+    if result["kind"] == "race":
+        return race_report.terminal_table(result)
     if result["kind"] == "transmittance":
         return _transmittance_table(result)
     cells = result["cells"]
@@ -186,6 +188,8 @@ def markdown(result: dict[str, Any]) -> str:
     """The summary as a Markdown table, with the same numbers."""
     if result["kind"] == "check":
         return check_report.markdown(result)
+    if result["kind"] == "race":
+        return race_report.markdown(result)
     if result["kind"] == "transmittance":
         head = ["fibre", "n", *_FIT_COLUMNS]
         body = [head, ["---"] * len(head), *_transmittance_rows(result)]

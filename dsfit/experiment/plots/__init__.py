@@ -36,6 +36,11 @@ def _figures(directory: RunDirectory, result: dict[str, Any]) -> Iterator[tuple[
     if result["kind"] == "check":
         yield from checks(directory, result)
         return
+    if result["kind"] == "race":
+        from dsfit.experiment.plots.race import race
+
+        yield "race", race(result)
+        return
     yield "convergence", convergence(result)
     yield "excess", excess_bars(result)
     if result["kind"] == "sweep" and (grid := excess_grid(result)) is not None:
