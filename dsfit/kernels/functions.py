@@ -1,0 +1,91 @@
+"""The four functions of a kernel on plain float32 tensors, eager or compiled."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dsfit.kernels.density import density, log_density
+from dsfit.kernels.draw import draw
+from dsfit.kernels.evaluate import evaluate
+from dsfit.kernels.geometry import Cell, Direction, Records
+from dsfit.kernels.layout import Layout
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Float32 tensors that every call reads.
+
+    Attributes:
+        constants: of the fibre, in the order of `evaluate.Constants`.
+        records: `[rows * columns, width]`.
+        averages: `[knots, 5 C]`.
+        laws: density and CDF of |phi|, each flat `[tables * law_rows * law_columns]`.
+    """
+
+    constants: Tensor
+    records: Tensor
+    averages: Tensor
+    laws: tuple[Tensor, Tensor]
+
+
+@dataclass(frozen=True)
+class Functions:
+    """`context` is theta_r, n, v; `mixture` is fields and sphere; directions are `[S, B]` or `[N]` with contexts `[B]`
+    or `[1]`."""
+
+    eval: Callable[..., Tensor]
+    log_prob: Callable[..., Tensor]
+    sample: Callable[..., tuple[Tensor, Tensor]]
+    sample_eval: Callable[..., tuple[Tensor, ...]]
+
+
+def plain_functions(layout: Layout) -> Functions:
+    """The functions of one layout, to be run eagerly or to be compiled."""
+
+    def prepared(records: Tensor, theta_r: Tensor, theta_i: Tensor, phi: Tensor) -> tuple[Direction, Records]:
+        direction = Direction.at(theta_i, phi, theta_r)
+        return direction, Records(records, Cell.of(direction, layout.rows, layout.columns), layout)
+
+    def evaluated(
+        constants: Tensor, records: Tensor, averages: Tensor, context: tuple, theta_i: Tensor, phi: Tensor
+    ) -> Tensor:
+        direction, cells = prepared(records, context[0], theta_i, phi)
+        return torch.stack(evaluate(layout, constants, averages, context, direction, cells, theta_i))
+
+    def log_prob(records: Tensor, theta_r: Tensor, mixture: tuple, theta_i: Tensor, phi: Tensor) -> Tensor:
+        direction, cells = prepared(records, theta_r, theta_i, phi)
+        return log_density(density(layout, *mixture, direction, cells))
+
+    def sample(theta_r: Tensor, fields: Tensor, laws: tuple, u: Tensor) -> tuple[Tensor, Tensor]:
+        return draw(layout, fields, theta_r, laws, u.unbind(-1))
+
+    def sample_eval(
+        constants: Tensor, records: Tensor, averages: Tensor, laws: tuple, context: tuple, mixture: tuple, u: Tensor
+    ) -> tuple[Tensor, ...]:
+        theta_i, phi = draw(layout, mixture[0], context[0], laws, u.unbind(-1))
+        direction, cells = prepared(records, context[0], theta_i, phi)
+        pdf = density(layout, *mixture, direction, cells)
+        value = evaluate(layout, constants, averages, context, direction, cells, theta_i)
+        return theta_i, phi, pdf, torch.stack(value)
+
+    return Functions(evaluated, log_prob, sample, sample_eval)
+
+
+@functools.lru_cache(maxsize=64)
+def functions(layout: Layout, compiled: bool) -> Functions:
+    """Made once per layout: fibres and proposals of the same layout share compiled code."""
+    plain = plain_functions(layout)
+    if not compiled:
+        return plain
+    options = {"cpp.enable_floating_point_contract_flag": "fast", "assert_indirect_indexing": False}
+    return Functions(
+        *(
+            torch.compile(f, dynamic=True, fullgraph=True, options=options)
+            for f in (plain.eval, plain.log_prob, plain.sample, plain.sample_eval)
+        )
+    )

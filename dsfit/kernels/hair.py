@@ -1,0 +1,144 @@
+"""Float32 kernels of the dual scattering BSDF and its amortised proposal, as a renderer calls them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dsfit.bsdf.dual_scattering import DualScattering
+from dsfit.bsdf.grey import first_channel
+from dsfit.bsdf.terms import TERMS, Terms
+from dsfit.context import Context
+from dsfit.errors import InputError, as_real, check_choice
+from dsfit.kernels.adapters import KernelIntegrand, KernelProposal
+from dsfit.kernels.contexts import Contexts, mixture_fields, need_of
+from dsfit.kernels.layout import NEEDS
+from dsfit.kernels.program import Program, build_program
+from dsfit.kernels.tables import Grid, average_table, azimuth_columns, check_served, law_tables
+from dsfit.proposals.amortised import AmortisedProposal
+from dsfit.scene.lights import Light
+
+_FINER = (2, 2)
+
+
+class HairKernel:
+    """eval, log_prob, sample and sample + pdf + eval of one fibre in float32.
+
+    Args:
+        bsdf: a round `marschner` fibre in the "consistent" form of the equations.
+        proposal: what is sampled; left out, an untrained `AmortisedProposal`. Its parameters are read at `prepare`.
+        terms: which terms of F are computed.
+        mode: "compiled", "eager", or "auto": compiled where that works, else eager; `backend` tells which, and why.
+
+    Angles are radians. `theta_i`, `phi = phi_r - phi_i` are `[S, B]`, uniforms `u` `[S, B, 3]`, contexts `[B]`, all
+    float32. Densities are per steradian. Values are `[S, B, C]` with the channels outermost in memory.
+
+    Nothing is checked per direction: angles must be finite and |theta_i| <= pi/2; then results are finite.
+
+    Raises:
+        InputError: a fibre that the tables do not serve, a proposal of another kind, terms without the glint where TRT
+            is needed.
+    """
+
+    def __init__(
+        self,
+        bsdf: DualScattering,
+        proposal: AmortisedProposal | None = None,
+        *,
+        terms: Terms | None = None,
+        mode: str = "auto",
+    ) -> None:
+        check_served(bsdf)
+        check_choice("mode", mode, ("auto", "compiled", "eager"))
+        self.bsdf, self.terms = bsdf, bsdf.terms if terms is None else terms
+        self.halves = {half: _served_terms(bsdf, getattr(self.terms, half)) for half in ("direct", "scattered")}
+        if not self.terms.glint and any("TRT" in names for names in self.halves.values()):
+            raise InputError("terms.glint", False, "True where TRT is needed: its caustic has no finite table")
+        self.mixture = AmortisedProposal(bsdf) if proposal is None else proposal
+        if not isinstance(self.mixture, AmortisedProposal):
+            raise InputError("proposal", type(proposal).__name__, "a dsfit AmortisedProposal")
+        self.backend = "eager" if mode == "eager" else "compiled"
+        self.fiber = first_channel(bsdf.fiber) if self.terms.grey else bsdf.fiber
+        own = bsdf.replace(fiber=self.fiber, terms=Terms())
+        self.laws = law_tables(self.mixture)
+        rows, columns = self.laws.grid.rows, self.laws.grid.columns
+        self.grid = Grid((rows - 1) * _FINER[0] + 1, (columns - 1) * _FINER[1] + 1)
+        self.columns = azimuth_columns(own, self.grid)
+        self.averages = average_table(own)
+        self._sphere = torch.tensor(self.mixture.defensive / (4 * math.pi), dtype=torch.float32)
+        self._programs: dict[str, Program] = {}
+
+    @property
+    def computed_channels(self) -> int:
+        """Number of channels that are computed: 1 for grey terms."""
+        return self.fiber.channels
+
+    @property
+    def channels(self) -> int:
+        """Number of channels C of values."""
+        return self.bsdf.channels
+
+    def prepare(self, theta_r: Any, n: Any = 0.0, v: Any = None) -> Contexts:
+        """Everything that depends on the context alone, for contexts `[B]` (see `Context` for what is allowed)."""
+        context = Context(*(None if x is None else as_real("context", x, torch.float32) for x in (theta_r, 0.0, n, v)))
+        return self.prepare_context(context.reshape(-1))
+
+    def prepare_context(self, context: Context) -> Contexts:
+        """`prepare` for a `Context` of batch shape `[B]`."""
+        bare = self.bare_contexts(context)
+        program = self._program(bare.need)
+        with torch.no_grad():
+            shape = self.mixture.shape(context.to(torch.float32))
+            parts = (shape.log_weights, shape.mode, shape.below, shape.above)
+            rows = [x[..., program.components].t().contiguous() for x in parts]
+            return dataclasses.replace(bare, fields=mixture_fields(bare.theta_r, *rows))
+
+    def bare_contexts(self, context: Context) -> Contexts:
+        """Contexts that `eval` takes, without a mixture."""
+        theta_r, n, v = (x.to(torch.float32).contiguous() for x in (context.theta_r, context.n, context.v))
+        return Contexts(theta_r, n, v, theta_r.new_empty(0), self._sphere, need_of(v))
+
+    @torch.no_grad()
+    def eval(self, contexts: Contexts, theta_i: Tensor, phi: Tensor) -> Tensor:
+        """F cos(theta_i) `[S, B, C]`."""
+        return self._values(self._program(contexts.need).eval(contexts, theta_i, phi))
+
+    @torch.no_grad()
+    def log_prob(self, contexts: Contexts, theta_i: Tensor, phi: Tensor) -> Tensor:
+        """Log density per steradian `[S, B]`."""
+        return self._program(contexts.need).log_prob(contexts, theta_i, phi)
+
+    @torch.no_grad()
+    def sample(self, contexts: Contexts, u: Tensor) -> tuple[Tensor, Tensor]:
+        """theta_i and phi `[S, B]` from uniforms."""
+        return self._program(contexts.need).sample(contexts, u)
+
+    @torch.no_grad()
+    def sample_eval(self, contexts: Contexts, u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """theta_i, phi, their density `[S, B]` and F cos(theta_i) `[S, B, C]`."""
+        theta_i, phi, pdf, value = self._program(contexts.need).sample_eval(contexts, u)
+        return theta_i, phi, pdf, self._values(value)
+
+    def integrand(self, light: Light | None = None) -> KernelIntegrand:
+        """The BSDF times a light (a furnace, if left out) where an `Integrand` is asked for."""
+        return KernelIntegrand(self, light)
+
+    def proposal(self) -> KernelProposal:
+        """The mixture where a `Proposal` is asked for."""
+        return KernelProposal(self)
+
+    def _values(self, value: Tensor) -> Tensor:
+        return value.movedim(0, -1).expand(*value.shape[1:], self.channels)
+
+    def _program(self, need: str) -> Program:
+        if need not in self._programs:
+            self._programs[need] = build_program(self, check_choice("need", need, NEEDS))
+        return self._programs[need]
+
+
+def _served_terms(bsdf: DualScattering, names: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(t for t in TERMS if t in names and (t != "back" or bool(bsdf.d_b > 0)))
