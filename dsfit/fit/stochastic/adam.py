@@ -6,7 +6,7 @@ estimated by
     mean_j (c_j - m_j / M_j) s_j,        M_j = mean of m over the other samples.
 
 `mean(c s)` has mean int dp/dy domega = 0: a control variate that without noise cancels m s / M where p is the best
-density. M_j does not know sample j, so the mean of the estimate is exactly in the direction of the gradient, `E[M / M_j]
+density. M_j does not know sample j, so its mean is exactly along the gradient, `E[M / M_j]
 >= 1` times it; that factor tends to 1 like 1 / samples, and differs from context to context, so contexts with heavy
 tails count a little more than others. No derivative passes through the samples: jumps of the integrand do no harm.
 

@@ -10,8 +10,8 @@ excess that is left. In general a fit of P parameters to N samples is worse than
 
     O = k P / (4 N),    k = E_qbar[(p / qbar)^2 (1 - h / (p^2 M))^2],
 
-to first order: k is 4 times the excess without noise, and at least the relative variance of h with it. What the samples
-see, the gain G from the start to their own optimum, contains O once too much. Two guards against taking noise for light:
+to first order: k is 4 times the excess without noise, and at least the relative variance of h with it. What samples
+see, the gain G from the start to their own optimum, has O in it once too much. Two guards against fitting noise:
 
     a pull `k / (4 N spread^2) |y - y_0|^2` towards the start, which keeps what few samples cannot tell where it was;
     the step is shortened to `1 - O / G` of the way from the start (James and Stein's factor, with the curvature of M
