@@ -196,9 +196,18 @@ def _ready(key: str, course: Course, peer: RacePeer) -> Ready:
         problem = Problem(integrand, stream_of(course.config), course.dtype, peer.uniforms, seed, own)
         generator = torch.Generator().manual_seed(seed)
         maker = registry.make(peer.kind, peer.options)
-        count = 1 if maker.per_context else min(_FIRST_USE, len(course.contexts))
-        _READY[key] = make_ready(maker, problem, course.contexts[:count].to(course.dtype), generator)
+        _READY[key] = make_ready(maker, problem, _first_uses(course, maker.per_context), generator)
     return _READY[key]
+
+
+def _first_uses(course: Course, per_context: bool) -> list[Context]:
+    """Contexts that a peer is used at before the race: the first of the stream, together, and of those that are lit,
+    and that are not, one by one, because code may be made for each kind."""
+    contexts = course.contexts.to(course.dtype)
+    if per_context:
+        return [contexts[:1]]
+    alone = [torch.nonzero(kind)[:1, 0] for kind in (contexts.v == 1, contexts.v == 0)]
+    return [contexts[: min(_FIRST_USE, len(contexts))], *(contexts[k] for k in alone if len(k))]
 
 
 def _stream(

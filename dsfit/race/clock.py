@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -76,20 +76,20 @@ class Ready:
     first_use: float
 
 
-def make_ready(peer: Peer, problem: Problem, contexts: Context, generator: torch.Generator) -> Ready:
-    """Prepare the peer and use it once, at some contexts `[B]` of the stream, all by the clock; packages are imported
-    before it starts."""
+def make_ready(peer: Peer, problem: Problem, uses: Sequence[Context], generator: torch.Generator) -> Ready:
+    """Prepare the peer and use it once at each batch of contexts `[B]` in `uses`, all by the clock; packages are
+    imported before it starts."""
     for name in peer.needs:
         importlib.import_module(name)
     compilers = _children()
     _, prepare = timed(lambda: peer.prepare(problem))
 
-    def use() -> None:
+    def use(contexts: Context) -> None:
         with torch.no_grad():
             sampler = peer.at(contexts)
             sampler.estimate(sampler.least, child(generator))
 
-    uses = [timed(use)[1] for _ in range(2)]
-    first = max(0.0, uses[0] - uses[1]) + _children() - compilers
+    twice = [[timed(lambda c=contexts: use(c))[1] for _ in range(2)] for contexts in uses]
+    first = sum(max(0.0, once - again) for once, again in twice) + _children() - compilers
     recorded = float(peer.recorded_seconds)
     return Ready(peer, prepare + recorded + first, prepare, recorded, first)

@@ -34,6 +34,7 @@ PEERS = {
     "ou_cauchy": Entry("cauchy", "Ou et al. 2012: Cauchy lobes and exponential caps"),
     "deon_offset": Entry("offset", "d'Eon et al. 2013: lobe, then offset through the fibre"),
     "table_2d": Entry("table", "a piecewise constant table of each context"),
+    "table_grid": Entry("table", "tables of a grid of contexts, made once"),
     "vegas": Entry("vegas", "VEGAS+ adapted to each context"),
     "zuko_flow": Entry("flow", "a conditional normalising flow trained once"),
 }

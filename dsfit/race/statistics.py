@@ -11,10 +11,12 @@ from torch import Tensor
 
 LEVEL = 0.95
 HEAVY = 0.5
-"""Largest share of the sum of squares that a single estimate may have before the error counts as heavy-tailed."""
+"""Share of the sum of squares from which on a single estimate decides and the error counts as heavy-tailed; more among
+few estimates, where the largest of normal errors may have as much once in a thousand times."""
 _CENTRED = 0.01
 _TEST_SHARE = 0.2
 _FEWEST = 8
+_CHANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -38,11 +40,19 @@ class Rmse:
     @property
     def heavy(self) -> bool:
         """Whether a single estimate makes up most of the sum, among enough of them to tell."""
-        return self.count >= _FEWEST and self.top_share > HEAVY
+        return self.count >= _FEWEST and self.top_share > _largest_share(self.count, HEAVY)
 
     def to_dict(self) -> dict[str, Any]:
         """As plain data."""
         return {**asdict(self), "heavy": self.heavy}
+
+
+def _largest_share(count: int, least: float) -> float:
+    """`least`, or what the largest of `count` squares of normal errors exceeds with probability `_CHANCE`."""
+    from scipy.special import chdtri
+
+    largest = float(chdtri(1.0, _CHANCE / count))
+    return max(least, largest / (largest + count - 1))
 
 
 def relative_squared(estimates: Tensor, truth: Tensor) -> Tensor:
@@ -108,9 +118,7 @@ def centred(deviations: Tensor, allowance: float, predicted: float = 0.0) -> Cen
         return Centred(False, 1.0, bias)
     error = torch.maximum(deviations.std(0), torch.tensor(predicted, dtype=torch.float64)) / math.sqrt(count)
     squared = deviations.square().sum(-1)
-    decided = float(squared.max()) > _TEST_SHARE * float(squared.sum()) and float(squared.max()) > 0 and count > 2 / (
-        _TEST_SHARE
-    )
+    decided = float(squared.max()) > _largest_share(count, _TEST_SHARE) * float(squared.sum())
     if float(torch.linalg.vector_norm(error)) > _CENTRED or decided:
         return Centred(False, 1.0, bias)
     t = (mean.abs() - allowance).clamp_min(0) / error.clamp_min(1e-300)
