@@ -40,7 +40,7 @@ class AmortisedProposal(Proposal):
     """Mixture of the integrand's own lobes for every context (theta_r, n, v) of one fibre.
 
     Components: R, TT, TRT with the fibre's azimuths given theta_diff; the same scattered (azimuths N^G), where R has
-    two; back scattering, if d_b > 0; one broad lobe; the defensive share of the uniform sphere. theta_i comes from
+    three; back scattering, if d_b > 0; one broad lobe; the defensive share of the uniform sphere. theta_i comes from
     split Gaussians in theta_h, which start at the moments m, s_-, s_+ and the energies E of the lobes (tables over
     theta_r and n, `LobeMoments`; energies times v or 1 - v) and are corrected by a small network of the context:
 
@@ -68,7 +68,7 @@ class AmortisedProposal(Proposal):
         self.defensive = as_number("defensive", defensive, 0.0, 1.0, open_low=True, open_high=True)
         self.lobes = LobeMoments(bsdf)
         direct, scattered = azimuth_tables(bsdf, False), azimuth_tables(bsdf, True)
-        laws: list[Azimuthal] = [*direct, *scattered, scattered[0]]
+        laws: list[Azimuthal] = [*direct, *scattered, scattered[0], scattered[0]]
         names = [*DIRECT, *SCATTERED]
         if self.lobes.back:
             names.append("back")
@@ -100,9 +100,9 @@ class AmortisedProposal(Proposal):
         near, far = self.lobes(theta_r, n)
         features = _features(context, near, far)
         near, far = _shared(near, v), _shared(far, 1 - v)
-        parts = [near[..., :3], far[..., :4]]
+        parts = [near[..., :3], far[..., :5]]
         if self.lobes.back:
-            parts.append(_together(near[..., 3:], far[..., 4:]))
+            parts.append(_together(near[..., 3:], far[..., 5:]))
         moments = torch.cat(parts, dim=-1)
         energy, mean, below, above = moments.unbind(-2)
         total = torch.logsumexp(energy, dim=-1, keepdim=True)
@@ -142,7 +142,7 @@ def _features(context: Context, near: Tensor, far: Tensor) -> Tensor:
         far[..., 2, 1] + 1,
         v,
         soft(lit.clamp(-100.0, 100.0) / 3),
-        soft((energy[..., 1] - torch.logaddexp(energy[..., 0], energy[..., 3])).clamp(-100.0, 100.0) / 3),
+        soft((energy[..., 1] - energy[..., [0, 3, 4]].logsumexp(dim=-1)).clamp(-100.0, 100.0) / 3),
     ]
     return torch.stack(columns, dim=-1)
 

@@ -17,14 +17,15 @@ from dsfit.quadrature import panel_points
 from dsfit.special import log_gauss
 
 DIRECT = ("R", "TT", "TRT")
-SCATTERED = ("R_scattered", "TT_scattered", "TRT_scattered", "R_scattered_high")
-"""R's scattered lobe is two: transmittance of dark hair has its peaks at grazing light, on both sides."""
+SCATTERED = ("R_scattered", "TT_scattered", "TRT_scattered", "R_scattered_low", "R_scattered_high")
+"""R's scattered lobe is three: a_f^n of dark hair has its peaks at grazing light, on both sides."""
 
 _DEPTHS = (0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0, 22.0, 32.0, 45.0, 64.0, 128.0, 256.0, 1024.0,
            4096.0, 16384.0)  # fmt: skip
 _ROWS, _POINTS = 181, 5
-_SIDE = 6.0
+_SIDE, _STEEP = 0.7, 7.0
 _FLOOR = -1e5
+_SKEW = 0.6
 
 
 class LobeMoments(torch.nn.Module):
@@ -53,7 +54,7 @@ class LobeMoments(torch.nn.Module):
         self.register_buffer("depths", torch.tensor(_DEPTHS, dtype=torch.float64))
 
     def forward(self, theta_r: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
-        """Moments of direct light `[*batch, 4, 3 (+ 1)]` and of scattered light `[*batch, 4, 4 (+ 1)]`; the last column
+        """Moments of direct light `[*batch, 4, 3 (+ 1)]` and of scattered light `[*batch, 4, 5 (+ 1)]`; the last column
         is back scattering, if d_b > 0."""
         position = (theta_r / math.pi + 0.5).clamp(0.0, 1.0) * (_ROWS - 1)
         row = position.detach().to(torch.int64).clamp(0, _ROWS - 2)
@@ -76,7 +77,7 @@ class LobeMoments(torch.nn.Module):
 
 
 def _row(bsdf: DualScattering, theta_r: Tensor, back: bool) -> tuple[Tensor, Tensor]:
-    """Moments at one viewing inclination: direct `[4, 3 (+ 1)]`, scattered `[depths, 4, 4 (+ 1)]`."""
+    """Moments at one viewing inclination: direct `[4, 3 (+ 1)]`, scattered `[depths, 4, 5 (+ 1)]`."""
     fiber = bsdf.fiber
     theta_i, weight = panel_points(theta_breaks(bsdf, theta_r), _POINTS)
     theta_h, diff = theta_half(theta_i, theta_r), theta_diff(theta_i, theta_r)
@@ -94,8 +95,7 @@ def _row(bsdf: DualScattering, theta_r: Tensor, back: bool) -> tuple[Tensor, Ten
         passed + e + log_gauss(shift[:, k, None], torch.sqrt(beta[:, k, None] ** 2 + wide))
         for k, e in enumerate(energies)
     ]
-    low, high = (torch.nn.functional.logsigmoid(sign * _SIDE * theta_i)[:, None] for sign in (-1, 1))
-    far = [far[0] + low, *far[1:], far[0] + high]
+    far = [far[0] + _part(theta_i, 0), *far[1:], far[0] + _part(theta_i, -1), far[0] + _part(theta_i, 1)]
     if back:
         offset = theta_h[:, None] - average.delta_b
         near.append(behind + log_gauss(offset, average.sigma_b))
@@ -104,18 +104,34 @@ def _row(bsdf: DualScattering, theta_r: Tensor, back: bool) -> tuple[Tensor, Ten
     return tables[0], tables[1]
 
 
+def _part(theta_i: Tensor, side: int) -> Tensor:
+    """log of a smooth partition of unity, `[J, 1]`: grazing light from below, from above, and the rest."""
+    low, high = torch.sigmoid(-_STEEP * (theta_i + _SIDE)), torch.sigmoid(_STEEP * (theta_i - _SIDE))
+    return _log((low, 1 - low - high, high)[side + 1]).unsqueeze(-1)
+
+
 def _moments(log_part: Tensor, log_measure: Tensor, theta_h: Tensor) -> Tensor:
-    """log energy, mean, log widths below and above it, `[..., 4]`, of a marginal `[..., J, C]`."""
+    """log energy, and mode and log widths of the split normal law with the marginal's mean, variance and skewness
+    (as far as such a law can have it), `[..., 4]`, of a marginal `[..., J, C]`.
+
+    With d = s_+ - s_- the split normal law has mean - mode = sqrt(2/pi) d, variance s_- s_+ + (1 - 2/pi) d^2 and third
+    central moment sqrt(2/pi) d (s_- s_+ + (4/pi - 1) d^2); solved for d by two fixed-point steps.
+    """
     log_mass = 0.5 * torch.logsumexp(2 * log_part, dim=-1) + log_measure
-    energy = torch.logsumexp(log_mass, dim=-1)
     share = torch.softmax(log_mass, dim=-1)
     mean = (share * theta_h).sum(-1, keepdim=True)
-    columns = [energy.clamp_min(_FLOOR), mean[..., 0]]
-    for side in (theta_h < mean, theta_h >= mean):
-        half = torch.where(side, share, 0.0)
-        square = (half * (theta_h - mean) ** 2).sum(-1) / half.sum(-1).clamp_min(1e-12)
-        columns.append(0.5 * torch.log(square.clamp(1e-10, 4.0)))
-    return torch.stack(columns, dim=-1)
+    variance = (share * (theta_h - mean) ** 2).sum(-1).clamp(1e-10, 4.0)
+    third = (share * (theta_h - mean) ** 3).sum(-1)
+    root = math.sqrt(2 / math.pi)
+    limit = _SKEW * torch.sqrt(variance / (1 - 2 / math.pi))
+    d = torch.zeros_like(variance)
+    for _ in range(4):
+        d = third / (root * (variance - (2 - 6 / math.pi) * d**2))
+        d = torch.minimum(torch.maximum(d, -limit), limit)
+    product = variance - (1 - 2 / math.pi) * d**2
+    center = torch.sqrt(product + d**2 / 4)
+    energy = torch.logsumexp(log_mass, dim=-1).clamp_min(_FLOOR)
+    return torch.stack([energy, mean[..., 0] - root * d, torch.log(center - d / 2), torch.log(center + d / 2)], dim=-1)
 
 
 def _log(x: Tensor) -> Tensor:

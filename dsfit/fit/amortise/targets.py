@@ -12,12 +12,13 @@ from dsfit.bsdf.averages import Averages
 from dsfit.bsdf.dual_scattering import DualScattering
 from dsfit.context import Context
 from dsfit.cubature import Cells, nodes_of
-from dsfit.frame import cos_inclination, theta_diff
+from dsfit.frame import HALF_PI, cos_inclination, theta_diff
 from dsfit.proposals.amortised import AmortisedProposal
-from dsfit.quadrature import panel_points
+from dsfit.quadrature import merge_breaks, panel_points
 from dsfit.scene.integrand import Integrand
 
 THETA_NODES, AZIMUTH_NODES = 3, 6
+_GRAZING = (1.3, 1.4, 1.48, 1.53)
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ def _row(
     """theta `[J]`, weight `[J, L]`, target `[J, L, M]`, laws `[J, L, K]` of one viewing inclination."""
     bsdf = integrand.bsdf
     both = Context(context.theta_r[0], 0.0, 1.0, 0.5)  # edges of direct and of scattered azimuths
-    theta, theta_weight = panel_points(integrand.theta_breaks(both), theta_nodes)
+    theta, theta_weight = panel_points(_breaks(integrand, both), theta_nodes)
     phi, weight = _azimuths(integrand, both, theta, azimuth_nodes)
     weight = 2 * theta_weight[:, None] * weight
     laws = [torch.exp(law(both).log_prob(phi, theta[:, None])) for law in proposal.laws]
@@ -112,6 +113,15 @@ def _row(
     target = torch.linalg.vector_norm(value, dim=-1) * cos_inclination(theta)[:, None, None]
     target = target / (weight[..., None] * target).sum((0, 1))
     return theta.to(dtype), weight.to(dtype), target.to(dtype), torch.stack(laws, dim=-1).to(dtype)
+
+
+def _breaks(integrand: Integrand, context: Context) -> Tensor:
+    """Panel ends in theta_i: those of the integrand, thinned where they are closer than a lobe asks for, and some next
+    to grazing, where a_f^n of dark hair has its peaks."""
+    narrow = 0.3 * float(integrand.bsdf.fiber.beta.detach().min())
+    grazing = torch.tensor([sign * x for x in _GRAZING for sign in (-1, 1)], dtype=torch.float64)
+    found = torch.cat([integrand.theta_breaks(context), grazing])
+    return merge_breaks(found, -HALF_PI, HALF_PI, min(narrow, 0.02))
 
 
 def _azimuths(integrand: Integrand, context: Context, theta: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,7 @@ from dsfit.fit.amortise.targets import Targets, make_targets
 from dsfit.proposals.amortised import AmortisedProposal
 from dsfit.streams import ContextStream
 
-TRAINING = ContextStream(theta="angle", rule="mixed")
+TRAINING = ContextStream(theta="angle", rule="mixed", direct=0.2, n_mean=15.0)
 STEPS = 1000
 _RATE, _LAST_RATE, _WARM = 1e-2, 1e-5, 30
 _BATCH = 24
