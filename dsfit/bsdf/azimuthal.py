@@ -159,11 +159,16 @@ def azimuthal_constant(
     return azimuthal_scattered(fiber, theta_diff, torch.zeros_like(theta_diff), phi_h, model, absorption, lobes)
 
 
-def support_edges(fiber: Fiber, theta_diff: Tensor, phi_h: Tensor | None = None) -> Tensor:
-    """|phi| in [0, pi] where some N_p starts, ends, or peaks: TT's edge, the TRT edge, the caustic; `[..., 3]`,
-    sorted.
+def support_edges(
+    fiber: Fiber, theta_diff: Tensor, phi_h: Tensor | None = None, lobes: tuple[int, ...] = ALL_LOBES
+) -> Tensor:
+    """|phi| in [0, pi] where N_p of some of `lobes` starts, ends, or peaks: TT's edge, the TRT edge, the caustic;
+    `[..., 0 to 3]`, sorted.
     """
     bent = refractions(fiber, theta_diff, phi_h)
     caustic = Caustic.at(bent[2].kappa)
-    edges = torch.broadcast_tensors(2 * torch.asin(bent[1].kappa), caustic.edge.abs(), caustic.phi)
+    whole = torch.broadcast_tensors(2 * torch.asin(bent[1].kappa), caustic.edge.abs(), caustic.phi)
+    edges = [edge for lobe, edge in zip((1, 2, 2), whole, strict=True) if lobe in lobes]
+    if not edges:
+        return whole[0].new_zeros(*whole[0].shape, 0)
     return torch.sort(torch.stack(edges, dim=-1), dim=-1).values.clamp(0.0, 2 * HALF_PI)

@@ -22,13 +22,18 @@ def theta_breaks(bsdf: DualScattering, theta_r: Tensor, extra: list[float] | Non
     fiber, theta_r = bsdf.fiber, theta_r.detach()
     alpha, beta = fiber.alpha.detach().to(theta_r), fiber.beta.detach().to(theta_r)
     steps = torch.tensor(_FLANKS, dtype=theta_r.dtype)
+    terms = bsdf.terms
+    lobes = sorted({*terms.direct_lobes, *terms.scattered_lobes})
+    alpha, beta = alpha[..., lobes], beta[..., lobes]
     points = [(2 * alpha[..., None] + 2 * beta[..., None] * steps - theta_r).flatten()]
-    average = bsdf.averages(-theta_r)
-    center, width = (2 * average.delta_b - theta_r).detach().flatten(), 4 * average.sigma_b.detach().flatten()
-    points += [center, center - width, center + width]
+    if "back" in (*terms.direct, *terms.scattered):
+        average = bsdf.averages(-theta_r)
+        center, width = (2 * average.delta_b - theta_r).detach().flatten(), 4 * average.sigma_b.detach().flatten()
+        points += [center, center - width, center + width]
     if bsdf.convention.back_argument == "theta_diff+theta_r":
         points.append(3 * theta_r.reshape(1))
-    points += [theta_r + 2 * sign * t for t in _jumps(bsdf) for sign in (-1, 1)]
+    if 2 in lobes:
+        points += [theta_r + 2 * sign * t for t in _jumps(bsdf) for sign in (-1, 1)]
     points.append(torch.tensor([*_REGULAR, *(extra or [])], dtype=theta_r.dtype))
     return merge_breaks(torch.cat([p.reshape(-1) for p in points]), -HALF_PI, HALF_PI, 1e-7)
 

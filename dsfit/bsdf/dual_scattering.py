@@ -88,6 +88,7 @@ class DualScattering(FiberAverages):
             raise InputError("terms", type(terms).__name__, "dsfit Terms")
         self.terms = Terms() if terms is None else terms
         self._selected: dict[tuple[int, ...], AzimuthTable] = {}
+        self.origin: DualScattering = self  # the one whose terms were first changed to make this one
         self._grey = None
         if self.terms.grey and fiber.channels > 1:
             self._grey = self.replace(fiber=first_channel(fiber))
@@ -101,6 +102,7 @@ class DualScattering(FiberAverages):
         }  # fmt: skip
         other = DualScattering(**{**arguments, **changes})
         if set(changes) == {"terms"}:  # tables do not depend on them
+            other.origin = self.origin
             for name in ("_cached_shares", "_cached_batch", "scattered_table"):
                 if name in self.__dict__:
                     other.__dict__[name] = self.__dict__[name]

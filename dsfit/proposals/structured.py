@@ -29,10 +29,10 @@ _TABLES: weakref.WeakKeyDictionary[DualScattering, dict[bool, list[FiberAzimuth]
 
 
 def azimuth_tables(bsdf: DualScattering, scattered: bool) -> list[FiberAzimuth]:
-    """`lobe_azimuths`, made once per BSDF."""
-    known = _TABLES.setdefault(bsdf, {})
+    """`lobe_azimuths`, made once per BSDF, whatever its terms."""
+    known = _TABLES.setdefault(bsdf.origin, {})
     if scattered not in known:
-        known[scattered] = lobe_azimuths(bsdf, scattered=scattered)
+        known[scattered] = lobe_azimuths(bsdf.origin, scattered=scattered)
     return known[scattered]
 
 
@@ -42,9 +42,9 @@ class StructuredProposal(Mixture):
 
     Components: R, TT, TRT where some light is direct (v > 0); their widened forms with azimuths N^G where some is
     scattered (v < 1); back scattering where d_b > 0; one broad lobe; and the defensive share of the uniform sphere.
-    What the contexts do not need is left out. Components start at the moments of the corresponding part of the
-    integrand, so that even unfitted the mixture is close; a fit then adjusts weights, modes and widths (4 parameters a
-    component).
+    What the contexts or the BSDF's terms do not need is left out. Components start at the moments of the corresponding
+    part of the integrand, so that even unfitted the mixture is close; a fit then adjusts weights, modes and widths (4
+    parameters a component).
 
     Args:
         bsdf: the BSDF whose azimuths and averages shape the mixture.
@@ -102,27 +102,31 @@ class _Start:
         """Name, energy and proposal of every component that the contexts need."""
         bsdf, fiber = self.bsdf, self.bsdf.fiber
         found: list[tuple[str, float, Proposal]] = []
+        terms = bsdf.terms
         direct, scattered = bool((self.context.v > 0).any()), bool((self.context.v < 1).any())
+        backs = (direct and "back" in terms.direct, scattered and "back" in terms.scattered)
         bent = refractions(fiber, self.diff, torch.full_like(self.diff, math.pi / 4))
         energies = lobe_energies(bent, fiber.sigma_a, bsdf.convention.absorption)
         theta_h = self.theta_h.unsqueeze(-1)
         for k, name in enumerate(("R", "TT", "TRT")):
             x, energy, beta = theta_h - fiber.alpha[k], energies[..., k, :], fiber.beta[k]
-            if direct:
+            if direct and name in terms.direct:
                 part = self.v * energy * torch.exp(log_gauss(x, beta))
                 found.append(self._component(name, part, azimuth_tables(bsdf, False)[k]))
-            if scattered:
+            if scattered and name in terms.scattered:
                 part = (1 - self.v) * self.passed * energy
                 part = part * torch.exp(log_gauss(x, torch.sqrt(beta**2 + self.variance_f)))
                 found.append(self._component(f"{name}_scattered", part, azimuth_tables(bsdf, True)[k]))
-        if bool(bsdf.d_b > 0):
+        if bool(bsdf.d_b > 0) and any(backs):
             found.append(self._component("back", self._back(theta_h), self._back_azimuth()))
         return found
 
     def _back(self, theta_h: Tensor) -> Tensor:
         average, x = self.average, theta_h - self.average.delta_b
-        near = self.v * torch.exp(log_gauss(x, average.sigma_b))
-        far = (1 - self.v) * self.passed * torch.exp(log_gauss(x, torch.sqrt(average.sigma_b**2 + self.variance_f)))
+        terms = self.bsdf.terms
+        widened = torch.sqrt(average.sigma_b**2 + self.variance_f)
+        near = ("back" in terms.direct) * self.v * torch.exp(log_gauss(x, average.sigma_b))
+        far = ("back" in terms.scattered) * (1 - self.v) * self.passed * torch.exp(log_gauss(x, widened))
         around = 4 if self.bsdf.convention.back_azimuth == "all" else 2
         return around * self.bsdf.d_b * average.A_b * (near + far)
 

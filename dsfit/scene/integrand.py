@@ -14,8 +14,9 @@ from dsfit.bsdf.dual_scattering import DualScattering
 from dsfit.context import Context
 from dsfit.errors import InputError
 from dsfit.frame import HALF_PI, theta_diff, wrap
-from dsfit.scene.lights import ConstantLight, Light
-from dsfit.scene.scattering import ConstantScattering, Scattering
+from dsfit.scene.lights import ConstantLight, Light, VonMisesFisherLights
+from dsfit.scene.scattering import ConstantScattering, Scattering, SlabScattering, SphereScattering
+from dsfit.special import is_differentiated
 
 
 class Integrand:
@@ -49,8 +50,7 @@ class Integrand:
     @property
     def is_even(self) -> bool:
         """Whether the integrand is an even function of the relative azimuth, whatever the context."""
-        plain = isinstance(self.light, ConstantLight) and isinstance(self.scattering, ConstantScattering)
-        return plain and self.bsdf.fiber.is_round
+        return self.bsdf.fiber.is_round and _turns(self.light) and _turns(self.scattering)
 
     def __call__(self, omega_i: Tensor, context: Context) -> Tensor:
         check_directions(omega_i, context.batch_shape, "omega_i")
@@ -78,33 +78,57 @@ class Integrand:
         `coarse` leaves out the weak edges of N^G, which matter to the last digits only.
         """
         diff = theta_diff(theta_i, context.theta_r)
-        fiber = self.bsdf.fiber
-        if fiber.is_round:
-            edges = support_edges(fiber, diff)
-        else:  # the edges move with phi_h: take those of both principal orientations
-            both = [support_edges(fiber, diff, torch.full_like(diff, a)) for a in (0.0, HALF_PI)]
-            edges = torch.cat(both, dim=-1)
-        points = [] if coarse and not self._lit(context) else [edges]
-        if self._scatters(context) and coarse:
+        points = [diff.new_zeros(*diff.shape, 0)]
+        if not coarse or self._lit(context):
+            points.append(self._support_edges(diff, self.bsdf.terms.direct_lobes))
+        if self._scatters(context):
+            if not coarse:
+                edges = self._support_edges(diff, self.bsdf.terms.scattered_lobes)
+                points += [(edges - HALF_PI).abs(), math.pi - (edges - HALF_PI).abs()]
             points.append(torch.full_like(diff, HALF_PI).unsqueeze(-1))
-        elif self._scatters(context):
-            shifted = torch.cat([(edges - HALF_PI).abs(), math.pi - (edges - HALF_PI).abs()], dim=-1)
-            points += [shifted, torch.full_like(diff, HALF_PI).unsqueeze(-1)]
         half = torch.cat(points, dim=-1)
-        extra = [float(wrap(context.phi_r.detach() - p)) for p in self._light_azimuths()]
+        azimuths = [] if self.is_even else self._light_azimuths()
+        extra = [float(wrap(context.phi_r.detach() - p)) for p in azimuths]
         fixed = torch.tensor([-math.pi, 0.0, math.pi, *extra], dtype=theta_i.dtype).expand(*theta_i.shape, -1)
         return torch.sort(torch.cat([half, -half, fixed], dim=-1), dim=-1).values.detach()
+
+    def _support_edges(self, diff: Tensor, lobes: tuple[int, ...]) -> Tensor:
+        fiber = self.bsdf.fiber
+        if fiber.is_round:
+            return support_edges(fiber, diff, lobes=lobes)
+        # the edges move with phi_h: take those of both principal orientations
+        both = [support_edges(fiber, diff, torch.full_like(diff, a), lobes) for a in (0.0, HALF_PI)]
+        return torch.cat(both, dim=-1)
 
     def _light_azimuths(self) -> list[float]:
         return [*self.light.breakpoints()[1], *self.scattering.breakpoints()[1]]
 
     def _lit(self, context: Context) -> bool:
         constant = isinstance(self.scattering, ConstantScattering)
-        return not constant or self.bsdf.convention.share == "sum" or bool((context.v != 0).any())
+        shared = not constant or self.bsdf.convention.share == "sum" or bool((context.v != 0).any())
+        return shared and bool(self.bsdf.terms.direct)
 
     def _scatters(self, context: Context) -> bool:
         constant = isinstance(self.scattering, ConstantScattering)
-        return not constant or self.bsdf.convention.share == "sum" or bool((context.v != 1).any())
+        shared = not constant or self.bsdf.convention.share == "sum" or bool((context.v != 1).any())
+        return shared and bool(self.bsdf.terms.scattered)
+
+
+def _turns(surroundings: Light | Scattering) -> bool:
+    """Whether light or scattering stays the same when turned about the fibre: constant, or with its axes (mean
+    directions, the normal of a slab, the offset in a ball) along the tangent.
+    """
+    if isinstance(surroundings, ConstantLight | ConstantScattering):
+        return True
+    if isinstance(surroundings, VonMisesFisherLights):
+        axes = surroundings.to_fibre_means()
+    elif isinstance(surroundings, SlabScattering):
+        axes = surroundings.normal
+    elif isinstance(surroundings, SphereScattering):
+        axes = surroundings.offset
+    else:
+        return False
+    return not is_differentiated(axes) and bool((axes[..., 1:].abs() <= 1e-16).all())
 
 
 __all__ = ["Integrand"]
