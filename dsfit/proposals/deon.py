@@ -29,8 +29,8 @@ class DeonProposal(Proposal):
 
     Direct light: `OffsetFamily`, and a share of TRT for the Gaussian glints that replace the caustic, which offsets do
     not reach. Scattered light: lobes in proportion to their energy, azimuths by a turned offset (`TurnedOffset`),
-    widths sqrt(beta_p^2 + n beta_f^2). Back scattering: uniform azimuth. A defensive share of the uniform sphere. Shares
-    and widths in closed form at every context (`ContextLobes`); nothing is fitted.
+    widths sqrt(beta_p^2 + n beta_f^2). Back scattering: uniform azimuth. A defensive share of the uniform sphere.
+    Shares and widths in closed form at every context (`ContextLobes`); nothing is fitted.
 
     The offset density of TRT is infinite at the caustic, where the integrand is not: weights only fall to 0 there.
 
@@ -67,9 +67,7 @@ class DeonProposal(Proposal):
         laws = [TruncatedGaussianInclination(context.theta_r, x, s) for x, s in zip(center, width, strict=True)]
         order = (2, 3, 4, 5, 5, 6)
         parts: list[Distribution] = [self._family(context, tuple(laws[:3]), center[:3])]
-        parts += [
-            ProductDistribution(context, laws[k], law(context)) for k, law in zip(order, self.laws, strict=True)
-        ]
+        parts += [ProductDistribution(context, laws[k], law(context)) for k, law in zip(order, self.laws, strict=True)]
         parts.append(self.sphere(context))
         return MixtureDistribution(parts, self._log_weights(shares))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -14,7 +15,9 @@ from dsfit.context import Context
 from dsfit.errors import InputError, as_number
 from dsfit.frame import HALF_PI, cos_inclination, wrap
 from dsfit.proposals.base import Distribution, Proposal
-from dsfit.scene.integrand import Integrand
+
+if TYPE_CHECKING:
+    from dsfit.scene.integrand import Integrand
 
 _EVALUATIONS_AT_ONCE = 1 << 18
 

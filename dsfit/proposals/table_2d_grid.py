@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -15,7 +16,9 @@ from dsfit.frame import HALF_PI, cos_inclination, wrap
 from dsfit.proposals.base import Distribution, Proposal
 from dsfit.proposals.mixture import log_sum_exp
 from dsfit.proposals.table_2d import Tables, check_count, check_resolution, tabulate
-from dsfit.scene.integrand import Integrand
+
+if TYPE_CHECKING:
+    from dsfit.scene.integrand import Integrand
 
 BLENDS = ("nearest", "linear")
 
