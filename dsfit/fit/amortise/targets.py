@@ -103,16 +103,24 @@ def _row(
     azimuth_nodes: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """theta `[J]`, weight `[J, L]`, target `[J, L, M]`, laws `[J, L, K]` of one viewing inclination."""
-    bsdf = integrand.bsdf
+    theta, phi, weight, target = best_density(integrand, context, theta_nodes, azimuth_nodes)
+    laws = [torch.exp(law(context[0]).log_prob(phi, theta[:, None])) for law in proposal.laws]
+    return theta.to(dtype), weight.to(dtype), target.to(dtype), torch.stack(laws, dim=-1).to(dtype)
+
+
+@torch.no_grad()
+def best_density(
+    integrand: Integrand, context: Context, theta_nodes: int, azimuth_nodes: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Nodes of contexts `[M]` with one theta_r: theta_i `[J]`, phi and weights `[J, L]`, and p* cos(theta_i)
+    `[J, L, M]` there, in float64; see `Targets`."""
     both = Context(context.theta_r[0], 0.0, 1.0, 0.5)  # edges of direct and of scattered azimuths
     theta, theta_weight = panel_points(_breaks(integrand, both), theta_nodes)
     phi, weight = _azimuths(integrand, both, theta, azimuth_nodes)
     weight = 2 * theta_weight[:, None] * weight
-    laws = [torch.exp(law(both).log_prob(phi, theta[:, None])) for law in proposal.laws]
-    value = _values(bsdf, context, theta, phi)
+    value = _values(integrand.bsdf, context, theta, phi)
     target = torch.linalg.vector_norm(value, dim=-1) * cos_inclination(theta)[:, None, None]
-    target = target / (weight[..., None] * target).sum((0, 1))
-    return theta.to(dtype), weight.to(dtype), target.to(dtype), torch.stack(laws, dim=-1).to(dtype)
+    return theta, phi, weight, target / (weight[..., None] * target).sum((0, 1))
 
 
 def _breaks(integrand: Integrand, context: Context) -> Tensor:
