@@ -51,7 +51,7 @@ class FamilyMember(AmortisedProposal):
         self.register_buffer("about", _about_fiber(quick))
         direct, scattered = quick.azimuth_laws(False), quick.azimuth_laws(True)
         back = BackHalf() if quick.convention.back_azimuth == "back" else UniformAzimuth()
-        self.laws = nn.ModuleList([*direct, *scattered, scattered[0], back, UniformAzimuth()])
+        self.laws = nn.ModuleList([*direct, *scattered, scattered[0], scattered[0], back, UniformAzimuth()])
         self.sphere, self.network = UniformSphere(), network
 
     def start(self, context: Context) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
