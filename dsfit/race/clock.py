@@ -20,6 +20,8 @@ from dsfit.race.peer import Peer, Problem
 from dsfit.random import child
 
 T = TypeVar("T")
+_FEW = 16
+"""Samples of a second first use: compilers take a single one for a case of its own."""
 
 
 def timed(work: Callable[[], T]) -> tuple[T, float]:
@@ -29,7 +31,7 @@ def timed(work: Callable[[], T]) -> tuple[T, float]:
     return result, time.process_time() - start
 
 
-def _children() -> float:
+def children_seconds() -> float:
     """CPU seconds of processes that were started from here and have ended."""
     try:
         import resource
@@ -81,15 +83,16 @@ def make_ready(peer: Peer, problem: Problem, uses: Sequence[Context], generator:
     imported before it starts."""
     for name in peer.needs:
         importlib.import_module(name)
-    compilers = _children()
+    compilers = children_seconds()
     _, prepare = timed(lambda: peer.prepare(problem))
 
     def use(contexts: Context) -> None:
         with torch.no_grad():
             sampler = peer.at(contexts)
-            sampler.estimate(sampler.least, child(generator))
+            for samples in (sampler.least, max(sampler.least, _FEW)):
+                sampler.estimate(samples, child(generator))
 
     twice = [[timed(lambda c=contexts: use(c))[1] for _ in range(2)] for contexts in uses]
-    first = sum(max(0.0, once - again) for once, again in twice) + _children() - compilers
+    first = sum(max(0.0, once - again) for once, again in twice) + children_seconds() - compilers
     recorded = float(peer.recorded_seconds)
     return Ready(peer, prepare + recorded + first, prepare, recorded, first)

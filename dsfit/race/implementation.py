@@ -5,28 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from dsfit.context import Context
 from dsfit.errors import InputError
-from dsfit.race.clock import timed
+from dsfit.race.clock import children_seconds, timed
 from dsfit.scene.integrand import Integrand
 
-
-class Lit:
-    """A compiled integrand under a constant light, with what an `Integrand` says about itself."""
-
-    def __init__(self, compiled: Any, exact: Integrand) -> None:
-        self.compiled, self.exact = compiled, exact
-        self.radiance = exact.light.radiance.to(torch.float32)
-        self.plain = bool((self.radiance == 1).all())
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.exact, name)
-
-    def __call__(self, omega_i: Tensor, context: Context) -> Tensor:
-        value = self.compiled(omega_i, context)
-        return value if self.plain else value * self.radiance
+_SHAPES = ((1, 1), (16, 1), (1, 16), (16, 16))
+"""Samples and contexts of the calls that a compiled integrand is compiled for."""
 
 
 def make_integrand(exact: Integrand, implementation: str, dtype: torch.dtype) -> tuple[Any, dict[str, Any]]:
@@ -45,10 +31,32 @@ def make_integrand(exact: Integrand, implementation: str, dtype: torch.dtype) ->
         if implementation == "compiled":
             raise InputError("race.implementation", implementation, f"'eager' ({error})") from None
         return exact, {"implementation": "eager", "reason": str(error)}
-    kernel, seconds = timed(lambda: HairKernel(exact.bsdf))
+    compile_here()
+    kernel = HairKernel(exact.bsdf)
+    integrand = kernel.integrand(exact.light)
+    spent = children_seconds()
+    _, seconds = timed(lambda: warm(integrand))
     backend = str(kernel.backend)
     if not backend.startswith("compiled"):
         if implementation == "compiled":
             raise InputError("race.implementation", implementation, f"'eager' (no compiled kernel: {backend})")
         return exact, {"implementation": "eager", "reason": backend}
-    return Lit(kernel.integrand(), exact), {"implementation": "compiled", "reason": backend, "compile_seconds": seconds}
+    seconds += children_seconds() - spent
+    return integrand, {"implementation": "compiled", "reason": backend, "compile_seconds": seconds}
+
+
+def compile_here() -> None:
+    """Let torch's compiler work in this process, where its seconds are counted, and not in a pool of others."""
+    import torch._inductor.config as inductor
+
+    inductor.compile_threads = 1
+
+
+def warm(integrand: Integrand) -> None:
+    """Call the integrand once for lit, unlit and mixed contexts, and single and many of them and of their samples."""
+    with torch.no_grad():
+        for samples, contexts in _SHAPES:
+            for v in (1.0, 0.0, 0.5) if contexts == 1 else (0.5,):
+                n = torch.full((contexts,), 0.0 if v == 1 else 2.0)
+                context = Context(torch.linspace(-0.3, 0.4, contexts), 0.0, n, torch.full_like(n, v))
+                integrand(torch.rand(samples, contexts, 2) - 0.5, context)

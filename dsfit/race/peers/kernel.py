@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dsfit.context import Context
 from dsfit.errors import InputError
+from dsfit.race.implementation import compile_here
 from dsfit.race.peer import Problem, Sampler
 from dsfit.race.peers.amortised import Amortised
 
@@ -28,6 +29,7 @@ class Kernel(Amortised):
 
         if problem.dtype != torch.float32:
             raise InputError("race.dtype", problem.dtype, "float32 for the peer 'kernel'")
+        compile_here()
         super().prepare(problem)
         self.radiance = problem.model.light.radiance.to(torch.float32)
         self.kernel = HairKernel(problem.model.bsdf, self.proposal)
