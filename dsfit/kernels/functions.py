@@ -1,8 +1,7 @@
-"""The four functions of a kernel on plain float32 tensors, eager or compiled."""
+"""The four functions of a kernel on plain float32 tensors, in torch."""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -45,7 +44,7 @@ class Functions:
 
 
 def plain_functions(layout: Layout) -> Functions:
-    """The functions of one layout, to be run eagerly or to be compiled."""
+    """The functions of one layout in torch: what the compiled ones must agree with, and their stand-in."""
 
     def prepared(records: Tensor, theta_r: Tensor, theta_i: Tensor, phi: Tensor) -> tuple[Direction, Records]:
         direction = Direction.at(theta_i, phi, theta_r)
@@ -74,18 +73,3 @@ def plain_functions(layout: Layout) -> Functions:
         return theta_i, phi, pdf, torch.stack(value)
 
     return Functions(evaluated, log_prob, sample, sample_eval)
-
-
-@functools.lru_cache(maxsize=64)
-def functions(layout: Layout, compiled: bool) -> Functions:
-    """Made once per layout: fibres and proposals of the same layout share compiled code."""
-    plain = plain_functions(layout)
-    if not compiled:
-        return plain
-    options = {"cpp.enable_floating_point_contract_flag": "fast", "assert_indirect_indexing": False}
-    return Functions(
-        *(
-            torch.compile(f, dynamic=True, fullgraph=True, options=options)
-            for f in (plain.eval, plain.log_prob, plain.sample, plain.sample_eval)
-        )
-    )

@@ -16,7 +16,9 @@ from dsfit.context import Context
 from dsfit.errors import InputError, as_real, check_choice
 from dsfit.kernels.adapters import KernelIntegrand, KernelProposal
 from dsfit.kernels.contexts import Contexts, mixture_fields, need_of
-from dsfit.kernels.layout import NEEDS
+from dsfit.kernels.functions import Functions, plain_functions
+from dsfit.kernels.layout import NEEDS, Layout
+from dsfit.kernels.native import NoCompiler, native_functions
 from dsfit.kernels.program import Program, build_program
 from dsfit.kernels.tables import Grid, average_table, azimuth_columns, check_served, law_tables
 from dsfit.proposals.amortised import AmortisedProposal
@@ -32,7 +34,8 @@ class HairKernel:
         bsdf: a round `marschner` fibre in the "consistent" form of the equations.
         proposal: what is sampled; left out, an untrained `AmortisedProposal`. Its parameters are read at `prepare`.
         terms: which terms of F are computed.
-        mode: "compiled", "eager", or "auto": compiled where that works, else eager; `backend` tells which, and why.
+        mode: "compiled" (C++, built for this machine at first use and cached), "eager" (torch), or "auto": compiled
+            where there is a compiler, else eager. `backend` tells which, and why.
 
     Angles are radians. `theta_i`, `phi = phi_r - phi_i` are `[S, B]`, uniforms `u` `[S, B, 3]`, contexts `[B]`, all
     float32. Densities are per steradian. Values are `[S, B, C]` with the channels outermost in memory.
@@ -41,7 +44,7 @@ class HairKernel:
 
     Raises:
         InputError: a fibre that the tables do not serve, a proposal of another kind, terms without the glint where TRT
-            is needed.
+            is needed, mode "compiled" without a compiler.
     """
 
     def __init__(
@@ -61,7 +64,7 @@ class HairKernel:
         self.mixture = AmortisedProposal(bsdf) if proposal is None else proposal
         if not isinstance(self.mixture, AmortisedProposal):
             raise InputError("proposal", type(proposal).__name__, "a dsfit AmortisedProposal")
-        self.backend = "eager" if mode == "eager" else "compiled"
+        self.backend, self._mode = "eager" if mode == "eager" else "compiled", mode
         self.fiber = first_channel(bsdf.fiber) if self.terms.grey else bsdf.fiber
         own = bsdf.replace(fiber=self.fiber, terms=Terms())
         self.laws = law_tables(self.mixture)
@@ -71,6 +74,18 @@ class HairKernel:
         self.averages = average_table(own)
         self._sphere = torch.tensor(self.mixture.defensive / (4 * math.pi), dtype=torch.float32)
         self._programs: dict[str, Program] = {}
+        self._program("both")
+
+    def functions(self, layout: Layout) -> Functions:
+        """The functions of a layout: compiled, or eager where that is asked for or nothing else works."""
+        if self.backend == "compiled":
+            try:
+                return native_functions(layout)
+            except NoCompiler as error:
+                if self._mode == "compiled":
+                    raise InputError("mode", "compiled", f"'eager' or 'auto' here: {error}") from None
+                self.backend = f"eager: {error}"
+        return plain_functions(layout)
 
     @property
     def computed_channels(self) -> int:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 NEEDS = ("both", "direct", "scattered")
+BLOCK = 16
+"""Directions that are computed at once: functions get at least as many."""
 LOBES = ("R", "TT", "TRT")
 FIELDS = ("mode", "below", "above", "log_scale", "edge", "left", "far_left", "near_left", "far_right", "near_right")
 """Per component of the mixture, each `[K, B]`.
@@ -64,6 +66,6 @@ class Layout:
 
     @property
     def width(self) -> int:
-        """Numbers per record, filled up to a multiple of 8: whole or half cache lines."""
+        """Numbers per record, filled up to whole cache lines."""
         sizes = [1 if name == "R_scattered" else self.channels for name in self.tabulated()]
-        return max(1, -(-(self.tables + sum(sizes)) // 8)) * 8
+        return max(1, -(-(self.tables + sum(sizes)) // 16)) * 16

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from dsfit.errors import InputError
 from dsfit.kernels.contexts import Contexts
-from dsfit.kernels.functions import Functions, Tables, functions
-from dsfit.kernels.layout import Layout
+from dsfit.kernels.functions import Functions, Tables
+from dsfit.kernels.layout import BLOCK, Layout
 from dsfit.kernels.tables import refined
 from dsfit.proposals.conditional import FiberAzimuth
 from dsfit.proposals.lobe_moments import DIRECT, SCATTERED
@@ -30,6 +30,7 @@ class Program:
         layout: what is computed.
         tables: what is read.
         components: numbers of the proposal's components that these contexts use.
+        run: the functions, on directions `[N]` with contexts `[1]` or `[N]`, or `[S, B]` with contexts `[B]`.
     """
 
     def __init__(self, layout: Layout, tables: Tables, components: list[int], run: Functions) -> None:
@@ -37,60 +38,64 @@ class Program:
 
     def eval(self, contexts: Contexts, theta_i: Tensor, phi: Tensor) -> Tensor:
         """Values `[C, S, B]`."""
-        shape = _check(contexts, theta_i, phi)
-        c, t = _matched(contexts, shape), self.tables
-        context = c.theta_r, c.n, c.v
-        value = self.run.eval(t.constants, t.records, t.averages, context, _flat(theta_i, c), _flat(phi, c))
-        return value.reshape(-1, *shape)
+        c, theta, azimuth = _arranged(contexts, theta_i, phi)
+        t = self.tables
+        value = self.run.eval(t.constants, t.records, t.averages, (c.theta_r, c.n, c.v), theta, azimuth)
+        return _restored(value, theta_i.shape, channels=True)
 
     def log_prob(self, contexts: Contexts, theta_i: Tensor, phi: Tensor) -> Tensor:
         """Log density `[S, B]`."""
-        shape = _check(contexts, theta_i, phi)
-        c = _matched(contexts, shape)
-        mixture = c.fields, c.sphere
-        return self.run.log_prob(self.tables.records, c.theta_r, mixture, _flat(theta_i, c), _flat(phi, c)).reshape(
-            shape
-        )
+        c, theta, azimuth = _arranged(contexts, theta_i, phi)
+        value = self.run.log_prob(self.tables.records, c.theta_r, (c.fields, c.sphere), theta, azimuth)
+        return _restored(value, theta_i.shape)
 
-    def sample(self, contexts: Contexts, u: Tensor) -> tuple[Tensor, Tensor]:
+    def sample(self, contexts: Contexts, u: Tensor) -> tuple[Tensor, ...]:
         """theta_i, phi `[S, B]`."""
-        shape = _check(contexts, u[..., 0])
-        c = _matched(contexts, shape)
-        theta_i, phi = self.run.sample(c.theta_r, c.fields, self.tables.laws, _flat(u, c, 3))
-        return theta_i.reshape(shape), phi.reshape(shape)
+        c, uniforms = _arranged(contexts, u)
+        drawn = self.run.sample(c.theta_r, c.fields, self.tables.laws, uniforms)
+        return tuple(_restored(x, u.shape[:2]) for x in drawn)
 
-    def sample_eval(self, contexts: Contexts, u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def sample_eval(self, contexts: Contexts, u: Tensor) -> tuple[Tensor, ...]:
         """theta_i, phi, density `[S, B]` and values `[C, S, B]`."""
-        shape = _check(contexts, u[..., 0])
-        c, t = _matched(contexts, shape), self.tables
+        c, uniforms = _arranged(contexts, u)
+        t = self.tables
         context, mixture = (c.theta_r, c.n, c.v), (c.fields, c.sphere)
-        theta_i, phi, pdf, value = self.run.sample_eval(
-            t.constants, t.records, t.averages, t.laws, context, mixture, _flat(u, c, 3)
-        )
-        return theta_i.reshape(shape), phi.reshape(shape), pdf.reshape(shape), value.reshape(-1, *shape)
+        found = self.run.sample_eval(t.constants, t.records, t.averages, t.laws, context, mixture, uniforms)
+        return tuple(_restored(x, u.shape[:2], channels=i == 3) for i, x in enumerate(found))
 
 
-def _check(contexts: Contexts, *given: Tensor) -> torch.Size:
-    """The shape `[S, B]` of float32 directions for these contexts."""
+def _arranged(contexts: Contexts, *given: Tensor) -> tuple:
+    """Contexts and directions or uniforms `[S, B, ...]` in the form that functions take: long inner loops.
+
+    One context, or one direction for each, makes a single dimension; a few contexts with many directions each are
+    repeated; and less than a block is filled up with copies.
+    """
     for value in given:
         if value.dtype != torch.float32:
             raise InputError("directions or uniforms", value.dtype, "torch.float32")
-        if value.ndim != 2 or value.shape[1] != len(contexts) or value.shape != given[0].shape:
-            raise InputError("directions or uniforms", tuple(value.shape), f"shape [S, {len(contexts)}]")
-    return given[0].shape
+        if value.shape[:2] != given[0].shape[:2] or value.ndim < 2 or value.shape[1] != len(contexts):
+            raise InputError("directions or uniforms", tuple(value.shape), f"shape [S, {len(contexts)}, ...]")
+        if not value.numel():
+            raise InputError("directions or uniforms", tuple(value.shape), "at least one direction")
+    samples, batch = given[0].shape[:2]
+    if 1 < batch < _FEW and samples > 1:
+        contexts = contexts.repeated(samples)
+    elif batch > 1 and samples > 1:
+        return contexts, *(x.contiguous() for x in given)
+    count, missing = samples * batch, BLOCK - samples * batch
+    flat = [x.reshape(count, *x.shape[2:]) for x in given]
+    if missing > 0:
+        index = torch.arange(BLOCK).clamp_max(count - 1)
+        flat = [x[index] for x in flat]
+        contexts = contexts[index] if batch > 1 else contexts
+    return contexts, *(x.contiguous() for x in flat)
 
 
-def _matched(contexts: Contexts, shape: torch.Size) -> Contexts:
-    """Contexts so that the inner loop is long: a few contexts with many samples each are repeated."""
-    samples, batch = shape
-    return contexts.repeated(samples) if 1 < batch < _FEW and samples > 1 else contexts
-
-
-def _flat(value: Tensor, contexts: Contexts, last: int = 0) -> Tensor:
-    """Directions `[S, B]`, or `[N]` where one context or one per direction is left; uniforms with a last dimension."""
-    tail = (last,) if last else ()
-    value = value.reshape(-1, len(contexts), *tail)
-    return value.reshape(-1, *tail) if 1 in value.shape[:2] else value
+def _restored(value: Tensor, shape: torch.Size, channels: bool = False) -> Tensor:
+    """Results for `[S, B]` directions; what filled up a block is dropped. Channels stay in front."""
+    if shape.numel() < BLOCK:
+        value = value[..., : shape.numel()]
+    return value.reshape(value.shape[0], *shape) if channels else value.reshape(shape)
 
 
 def build_program(kernel: HairKernel, need: str) -> Program:
@@ -125,10 +130,10 @@ def build_program(kernel: HairKernel, need: str) -> Program:
     tensors = Tables(
         constants=_constants(kernel),
         records=_records(kernel, layout, density),
-        averages=kernel.averages.flatten(1).to(torch.float32).contiguous(),
+        averages=_averages(kernel),
         laws=tuple(x.to(torch.float32).flatten().contiguous() for x in (density, kernel.laws.cumulative[tables])),
     )
-    return Program(layout, tensors, components, functions(layout, kernel.backend == "compiled"))
+    return Program(layout, tensors, components, kernel.functions(layout))
 
 
 def _constants(kernel: HairKernel) -> Tensor:
@@ -144,6 +149,12 @@ def _constants(kernel: HairKernel) -> Tensor:
     ]
     rest = [fiber.alpha.detach(), fiber.beta.detach() ** 2, fiber.sigma_a.detach()]
     return torch.cat([torch.tensor(head, dtype=torch.float64), *(x.double() for x in rest)]).to(torch.float32)
+
+
+def _averages(kernel: HairKernel) -> Tensor:
+    """`[knots, 5 C]`, rows filled up to whole cache lines."""
+    flat = kernel.averages.flatten(1)
+    return torch.nn.functional.pad(flat, (0, -flat.shape[1] % 16)).to(torch.float32).contiguous()
 
 
 def _records(kernel: HairKernel, layout: Layout, density: Tensor) -> Tensor:
