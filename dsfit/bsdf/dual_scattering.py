@@ -88,7 +88,6 @@ class DualScattering(FiberAverages):
             raise InputError("terms", type(terms).__name__, "dsfit Terms")
         self.terms = Terms() if terms is None else terms
         self._selected: dict[tuple[int, ...], AzimuthTable] = {}
-        self.origin: DualScattering = self  # the one whose terms were first changed to make this one
         self._grey = None
         if self.terms.grey and fiber.channels > 1:
             self._grey = self.replace(fiber=first_channel(fiber))
@@ -103,9 +102,6 @@ class DualScattering(FiberAverages):
         other = DualScattering(**{**arguments, **changes})
         if set(changes) == {"terms"}:  # tables do not depend on them
             other.origin = self.origin
-            for name in ("_cached_shares", "_cached_batch", "scattered_table"):
-                if name in self.__dict__:
-                    other.__dict__[name] = self.__dict__[name]
         return other
 
     @one_channel
@@ -244,6 +240,8 @@ class DualScattering(FiberAverages):
     @functools.cached_property
     def scattered_table(self) -> AzimuthTable:
         """N^G as `precision="table"` has it, whatever the terms."""
+        if self.origin is not self:
+            return self.origin.scattered_table
         fiber, absorption = self._fiber(torch.float64), self.convention.absorption
         return AzimuthTable(lambda diff, phi: azimuthal_scattered(fiber, diff, phi, None, self.model, absorption))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,6 +23,7 @@ class FiberAverages:
     def __init__(self, fiber: Fiber, d_b: Tensor, convention: Convention) -> None:
         self.fiber, self.d_b, self.convention = fiber, d_b, convention
         self._fibers = {fiber.dtype: fiber}
+        self.origin: Any = self  # the BSDF whose terms were changed to make this one: its tables serve both
 
     @property
     def channels(self) -> int:
@@ -83,6 +85,8 @@ class FiberAverages:
 
     @functools.cached_property
     def _cached_shares(self) -> LobeShares:
+        if self.origin is not self:
+            return self.origin._cached_shares
         return self._tables(self._fiber(torch.float64))
 
     @property
@@ -93,6 +97,8 @@ class FiberAverages:
 
     @functools.cached_property
     def _cached_batch(self) -> list[LobeShares]:
+        if self.origin is not self:
+            return self.origin._cached_batch
         return self._build_batch()
 
     def _build_batch(self) -> list[LobeShares]:

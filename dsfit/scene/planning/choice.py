@@ -13,6 +13,7 @@ from dsfit.scene.planning.terms import NAMES, SUBSETS
 _LOBES = {"direct": (0.15, 0.25, 5.0), "scattered table": (0.4, 0.4, 0.4), "scattered exact": (3.0, 4.0, 22.0)}
 _TREATMENT = 1.0
 _BACK, _AVERAGES = 0.4, 2.0
+_UNBOUNDED = 1e200
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,7 @@ def choose(
         table: whether N^G is looked up, not integrated.
         treatment: whether there is a treatment to leave out.
     """
+    upper = upper.clamp_max(_UNBOUNDED)  # times 0 it must be 0
     best: tuple[float, float] | None = None
     found = None
     for treated in (True, False) if treatment else (True,):

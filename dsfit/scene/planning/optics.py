@@ -44,8 +44,11 @@ class Optics:
     treatment: RangeTable
 
 
-def optics(bsdf: DualScattering) -> Optics:
-    """Enclosures of a BSDF of one fibre, whose azimuths carry the lobes' energies."""
+def optics(bsdf: DualScattering, scatters: bool = True) -> Optics:
+    """Enclosures of a BSDF of one fibre, whose azimuths carry the lobes' energies.
+
+    Where nothing scattered is asked about, no table of N^G is made for it: `scattered` is then that of the exact N^G.
+    """
     fiber = bsdf.fiber.to(torch.float64)
     breaks = torch.linspace(0.0, HALF_PI, _ROWS + 1, dtype=torch.float64)
     d = Interval(breaks[:-1, None], breaks[1:, None])
@@ -62,7 +65,8 @@ def optics(bsdf: DualScattering) -> Optics:
     if bsdf.model == "marschner" and bsdf.terms.glint:
         energies[2], added = _treated(fiber, raw[2], d, absorption)
     direct = _stack(energies)
-    scattered, scattered_peak = _scattered(bsdf, direct, breaks)
+    tabulated = scatters and bsdf.precision == "table"
+    scattered, scattered_peak = _scattered(bsdf, direct, breaks, tabulated)
     if not fiber.is_round:  # the index of TRT turns with phi: no integral over offsets
         direct = Interval(_with_trt(direct.low, 0.0), _with_trt(direct.high, math.inf))
     zero = torch.zeros_like(direct.high)
@@ -166,14 +170,14 @@ def _caustic_offset(kappa: Tensor) -> Tensor:
     return torch.atan2(torch.sqrt(opposite), torch.sqrt(((1 - kappa) * (1 + kappa)).clamp_min(0.0)))
 
 
-def _scattered(bsdf: DualScattering, energy: Interval, breaks: Tensor) -> tuple[Interval, Tensor]:
+def _scattered(bsdf: DualScattering, energy: Interval, breaks: Tensor, tabulated: bool) -> tuple[Interval, Tensor]:
     """int |N^G| dphi and sup |N^G|.
 
     N^G is 1/pi times the mass of N in a half circle: its integral is that of N, its largest value at most E / pi. Of an
     eccentric fibre, whose index is held during the average, only the last is known, so its integral is at most 2 E. The
     quadrature of the exact N^G is good to 1e-8. A table is bounded by itself: by its coefficients around each cell.
     """
-    if bsdf.precision == "exact":
+    if not tabulated:
         slack = 1e-6
         low, high, peak = energy.low * (1 - slack), energy.high * (1 + slack), energy.high * (1 + slack) / math.pi
         if not bsdf.fiber.is_round:

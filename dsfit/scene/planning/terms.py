@@ -57,9 +57,9 @@ def bound_terms(bsdf: DualScattering, boxes: Boxes, spread: Callable[[Boxes], tu
         spread: n and v of the light that arrives, `[B, J]`, for boxes `[B]`: at every direction, they are in one of
             the J pairs of intervals.
     """
-    tables = optics(bsdf), average_bounds(bsdf)
     n, v = spread(boxes)
     lit, unlit = v, Interval(1 - v.high, 1 - v.low)
+    tables = optics(bsdf, scatters=bool((unlit.high > 0).any())), average_bounds(bsdf)
     if n.low.shape[1] > 1:
         parts = _in_chunks(bsdf, tables, boxes.theta_r, n, lit, unlit)
         low = None
