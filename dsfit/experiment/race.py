@@ -226,7 +226,8 @@ def _contexts(course: Course, ready: Ready, generator: torch.Generator) -> dict[
     rows = []
     for values, context, truth, nodes in course.single:
         context = context.to(course.dtype)
-        row = race_context(ready, context, truth, plan, generator, allowance=course.allowance, nodes=nodes)
+        known = nodes if ready.uniforms == "random" else None  # Sobol points do better than quadrature predicts
+        row = race_context(ready, context, truth, plan, generator, allowance=course.allowance, nodes=known)
         rows.append({"context": values, **row})
     return {"contexts": rows}
 

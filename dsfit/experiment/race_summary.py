@@ -13,8 +13,8 @@ from dsfit.race.curve import Curve, Reading
 HEURISTICS = ("single", "chapter", "best_mix", "stream_mix")
 """Peers made of the chapter's proposals: what "best heuristic" is taken from."""
 TARGETS = (0.01, 0.001)
-UNDERSTATED = 4.0
-"""Quadrature's variance over the measured one beyond which an error is taken as understated."""
+UNDERSTATED = 2.0
+"""Error that quadrature predicts over the upper end of the measured one's interval beyond which it is understated."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Entrant:
     @property
     def heavy(self) -> bool:
         """Whether its errors are understated: one estimate decides the last root mean square, or quadrature says that
-        the variance is far larger than measured."""
+        it is far larger than measured."""
         rows = [*([self.stream] if self.stream else []), *(self.contexts or [])]
         return any(_heavy(row) for row in rows)
 
@@ -50,9 +50,8 @@ class Entrant:
 
 def _heavy(row: dict[str, Any]) -> bool:
     last = row["points"][-1]
-    measured = number(last["rmse"]["value"]) ** 2 * last["samples"]
-    predicted = number(row.get("predicted_variance", math.nan))
-    return bool(last["rmse"]["heavy"]) or (measured > 0 and predicted > UNDERSTATED * max(measured, 1e-12))
+    predicted = math.sqrt(max(number(row.get("predicted_variance", math.nan)), 0.0) / last["samples"])
+    return bool(last["rmse"]["heavy"]) or predicted > UNDERSTATED * number(last["rmse"]["high"])
 
 
 def entrants(cells: list[dict[str, Any]]) -> list[Entrant]:

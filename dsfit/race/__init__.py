@@ -1,0 +1,1 @@
+"""Races between estimators: error against run time, with everything counted that they prepare."""

@@ -68,6 +68,7 @@ class Ready:
         peer: prepared, and used once.
         seconds: everything done once: preparation, recorded seconds of earlier training, and what a first use costs
             beyond a second one (tables, compilers).
+        uniforms: kind of its uniform numbers.
         prepare, recorded, first_use: its parts; compilers count as first use.
     """
 
@@ -76,6 +77,7 @@ class Ready:
     prepare: float
     recorded: float
     first_use: float
+    uniforms: str = "random"
 
 
 def make_ready(peer: Peer, problem: Problem, uses: Sequence[Context], generator: torch.Generator) -> Ready:
@@ -95,4 +97,4 @@ def make_ready(peer: Peer, problem: Problem, uses: Sequence[Context], generator:
     twice = [[timed(lambda c=contexts: use(c))[1] for _ in range(2)] for contexts in uses]
     first = sum(max(0.0, once - again) for once, again in twice) + children_seconds() - compilers
     recorded = float(peer.recorded_seconds)
-    return Ready(peer, prepare + recorded + first, prepare, recorded, first)
+    return Ready(peer, prepare + recorded + first, prepare, recorded, first, problem.uniforms)

@@ -31,7 +31,6 @@ def make_integrand(exact: Integrand, implementation: str, dtype: torch.dtype) ->
         if implementation == "compiled":
             raise InputError("race.implementation", implementation, f"'eager' ({error})") from None
         return exact, {"implementation": "eager", "reason": str(error)}
-    compile_here()
     kernel = HairKernel(exact.bsdf)
     integrand = kernel.integrand(exact.light)
     spent = children_seconds()
@@ -43,13 +42,6 @@ def make_integrand(exact: Integrand, implementation: str, dtype: torch.dtype) ->
         return exact, {"implementation": "eager", "reason": backend}
     seconds += children_seconds() - spent
     return integrand, {"implementation": "compiled", "reason": backend, "compile_seconds": seconds}
-
-
-def compile_here() -> None:
-    """Let torch's compiler work in this process, where its seconds are counted, and not in a pool of others."""
-    import torch._inductor.config as inductor
-
-    inductor.compile_threads = 1
 
 
 def warm(integrand: Integrand) -> None:

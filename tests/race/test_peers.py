@@ -140,3 +140,28 @@ def test_unknown_peers_and_options_are_refused(kind: str, options: dict[str, Any
 def test_unknown_proposals_are_refused_when_they_are_prepared(scene: Any) -> None:
     with pytest.raises(InputError, match="M_R"):
         registry.make("single", {"proposal": "M_X"}).prepare(Problem(scene[0], ContextStream(), exact=scene[0]))
+
+
+@pytest.mark.slow
+def test_kernels_estimate_the_same_and_the_race_gives_their_integrand_to_all() -> None:
+    from dsfit.race.implementation import make_integrand
+
+    fiber = dsfit.Fiber.preset("blond", eccentricity=1.0)
+    exact = dsfit.Integrand(dsfit.DualScattering(fiber, precision="table"))
+    integrand, facts = make_integrand(exact, "auto", torch.float32)
+    context = dsfit.Context([0.3, -0.9], 0.0, [0.0, 4.0], dtype=torch.float32)
+    omega = torch.rand(50, 2, 2) - 0.5
+    close = exact(omega.double(), context.to(torch.float64))
+    assert torch.allclose(integrand(omega, context).double(), close, rtol=0.02)
+    if facts["implementation"] == "compiled":
+        assert integrand is not exact and facts["compile_seconds"] >= 0
+    estimates_are_centred((exact, StreamReference(exact)), "kernel", {"train": False}, 256)
+
+
+def test_implementations_that_do_not_go_with_float64_are_refused(scene: Any) -> None:
+    from dsfit.race.implementation import make_integrand
+
+    assert make_integrand(scene[0], "auto", torch.float64)[0] is scene[0]
+    assert make_integrand(scene[0], "eager", torch.float32)[1]["implementation"] == "eager"
+    with pytest.raises(InputError, match="float64"):
+        make_integrand(scene[0], "compiled", torch.float64)

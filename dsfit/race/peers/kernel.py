@@ -9,16 +9,15 @@ from torch import Tensor
 
 from dsfit.context import Context
 from dsfit.errors import InputError
-from dsfit.race.implementation import compile_here
 from dsfit.race.peer import Problem, Sampler
 from dsfit.race.peers.amortised import Amortised
 
 
 class Kernel(Amortised):
-    """As `amortised`, with directions, densities and values from `dsfit.kernels.HairKernel`, in float32.
+    """As `amortised`, with directions, densities and values from `dsfit.kernels.HairKernel`, in float32, all in one
+    call: the BSDF by the kernel that the race's compiled integrand has, whatever the race's implementation.
 
-    It evaluates the BSDF by its own kernel, the one that the race's compiled integrand has, whatever the race's
-    implementation.
+    Code that an earlier kernel of the same layout had compiled is found in the cache, and is not counted again.
     """
 
     name: ClassVar[str] = "kernel"
@@ -29,7 +28,6 @@ class Kernel(Amortised):
 
         if problem.dtype != torch.float32:
             raise InputError("race.dtype", problem.dtype, "float32 for the peer 'kernel'")
-        compile_here()
         super().prepare(problem)
         self.radiance = problem.model.light.radiance.to(torch.float32)
         self.kernel = HairKernel(problem.model.bsdf, self.proposal)
@@ -52,4 +50,4 @@ class _KernelSampler(Sampler):
         return torch.as_tensor(total) * self.peer.radiance / samples
 
     def log_prob(self, omega: Tensor) -> Tensor | None:
-        return self.peer.proposal(self.contexts).log_prob(omega.to(self.contexts.dtype))
+        return self.peer.kernel.proposal()(self.contexts).log_prob(omega.to(self.contexts.dtype))
