@@ -1,5 +1,5 @@
-"""The command line: `dsfit run CONFIG`, `dsfit check CONFIG`, `dsfit bench CONFIG`, `dsfit show RUNDIR`, `dsfit
-presets`.
+"""The command line: `dsfit run CONFIG`, `dsfit check CONFIG`, `dsfit bench CONFIG`, `dsfit plan CONFIG`,
+`dsfit show RUNDIR`, `dsfit presets`.
 
 Exit codes: 0 done, 1 the run failed (what is done is kept), 2 the config or an argument is wrong (nothing was
 written), 3 a check was not passed, 130 interrupted.
@@ -109,6 +109,21 @@ def _run(config: Path, changes: list[str], out: Path | None, force: bool, worker
     except (RunFailure, InputError, OSError) as error:
         _fail(f"run failed: {error}\nthe same command goes on from here: {directory.path}", 1)
     return outcome.result
+
+
+@app.command()
+def plan(config: Config, set_: Changes = None) -> None:
+    """Print what the config's contexts do not need: what is left out, why, and the proven bound on the error. `--set
+    plan.tolerance=1e-3` allows for more than exact zeros."""
+    from dsfit.errors import InputError
+    from dsfit.experiment.planning import plans
+    from dsfit.experiment.validation import load
+
+    try:
+        for heading, found in plans(load(config, set_ or [])):
+            _console().print(f"{heading}: {found}", soft_wrap=True)
+    except InputError as error:
+        _fail(f"config error\n{error}", 2)
 
 
 @app.command()

@@ -19,6 +19,7 @@ from dsfit.experiment import build
 from dsfit.experiment.cells import Job
 from dsfit.experiment.judge import judge
 from dsfit.experiment.methods import Plan, Setting, make_plan
+from dsfit.experiment.planning import plan_of
 from dsfit.experiment.rundir import RunDirectory
 from dsfit.experiment.schema import EstimateConfig
 from dsfit.experiment.store import save_proposal
@@ -34,10 +35,14 @@ def compare(
     from dsfit.quality import reference as integrate
 
     config, context = job.config, build.context(job.config, job.identity["context"])
-    integrand = build.integrand(config)
+    say("plan")
+    planned = plan_of(config, context)
+    integrand = planned.integrand
     say("reference")
     clock = time.perf_counter()
     reference = integrate(integrand, context, rtol=config.estimate.rtol)
+    # what was left out by a bound counts as error of every estimate
+    truth = reference if planned.bound == 0 else integrate(planned.whole, context, rtol=config.estimate.rtol)
     reference_seconds = time.perf_counter() - clock
     setting = Setting(config, integrand, context)
     grid, arrays = _map_grid(context)
@@ -60,21 +65,22 @@ def compare(
             plan.fit["file"] = path.relative_to(directory.path).as_posix()
         say(f"{method.name}: estimates")
         generator = torch.Generator().manual_seed(_seed(config.estimate.seed, job.identity, method.name))
-        curve = _estimates(plan, integrand, context, config.estimate, reference, numbers["variance"], generator)
+        curve = _estimates(plan, integrand, context, config.estimate, truth, numbers["variance"], generator)
         with torch.no_grad():
             arrays[f"density_{k}"] = _image(plan.density(grid, context))
         found.append({"name": method.name, "kind": method.kind, **plan.description(), **numbers, **curve})
     data = {
         "context": {name: getattr(context, name).item() for name in ("theta_r", "phi_r", "n", "v")},
         "reference": {
-            "value": reference.value.tolist(),
-            "error": reference.error.tolist(),
-            "norm": norm,
-            "norm_error": float(reference.norm_error),
-            "evaluations": int(reference.evaluations),
-            "converged": bool(torch.as_tensor(reference.converged).all()),
+            "value": truth.value.tolist(),
+            "error": truth.error.tolist(),
+            "norm": float(truth.norm),
+            "norm_error": float(truth.norm_error),
+            "evaluations": int(truth.evaluations),
+            "converged": bool(torch.as_tensor(truth.converged).all()),
             "seconds": reference_seconds,
         },
+        "plan": planned.to_dict(),
         "judge_seconds": judge_seconds,
         "methods": found,
     }

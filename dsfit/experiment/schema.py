@@ -7,6 +7,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from dsfit.experiment.check_schema import CheckConfig
+from dsfit.experiment.schema_amortise import AmortiseConfig, AmortisedMethod
+from dsfit.experiment.schema_plan import PlanConfig
 from dsfit.experiment.schema_race import RaceConfig
 from dsfit.experiment.sections import Section
 
@@ -190,7 +192,8 @@ class FittedMethod(Method):
 
 
 MethodConfig = Annotated[
-    UniformMethod | LightMethod | SingleMethod | HeuristicMixMethod | FittedMethod, Field(discriminator="kind")
+    UniformMethod | LightMethod | SingleMethod | HeuristicMixMethod | FittedMethod | AmortisedMethod,
+    Field(discriminator="kind"),
 ]
 LightConfig = Annotated[ConstantLight | LobesLight | EnvironmentLight, Field(discriminator="kind")]
 ScatteringConfig = Annotated[ConstantScattering | SlabScattering | SphereScattering, Field(discriminator="kind")]
@@ -234,12 +237,13 @@ class Config(Section):
     """A whole experiment."""
 
     title: Annotated[str, Field(max_length=200)] = ""
-    kind: Literal["compare", "sweep", "transmittance", "check", "race"] = "compare"
+    kind: Literal["compare", "sweep", "transmittance", "check", "race", "amortise"] = "compare"
     fiber: FiberConfig = FiberConfig()
     bsdf: BsdfConfig = BsdfConfig()
     light: LightConfig = ConstantLight()
     scattering: ScatteringConfig = ConstantScattering()
     contexts: ContextsConfig = ContextsConfig()
+    plan: PlanConfig = PlanConfig()
     methods: list[MethodConfig] = []
     estimate: EstimateConfig = EstimateConfig()
     output: OutputConfig = OutputConfig()
@@ -247,3 +251,4 @@ class Config(Section):
     transmittance: TransmittanceConfig = TransmittanceConfig()
     check: CheckConfig = CheckConfig()
     race: RaceConfig = RaceConfig()
+    amortise: AmortiseConfig = AmortiseConfig()
