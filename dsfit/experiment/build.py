@@ -172,7 +172,7 @@ def check(raw: RawConfig, config: Config) -> None:
         section = error.field.split(".")[0]
         raise library_error(raw, section if section in ("light", "fiber") else "bsdf", error) from None
     for index, method in enumerate(config.methods):
-        check_method(raw, index, method)
+        check_method(raw, index, method, config)
     if config.kind == "check":
         from dsfit.experiment.checking import validate
 
@@ -181,3 +181,7 @@ def check(raw: RawConfig, config: Config) -> None:
         from dsfit.experiment.race import check as check_race
 
         check_race(raw, config)
+    if config.kind == "amortise":
+        from dsfit.experiment.amortise import check as check_amortise
+
+        check_amortise(raw, config)

@@ -50,7 +50,7 @@ def jobs(experiment: Experiment) -> list[Job]:
                 found.append(Job(len(found), _label(point.config, identity), identity, point.config))
             continue
         values = list(build.context_values(point.config.contexts))
-        for context in [{}] if experiment.config.kind == "transmittance" else values:
+        for context in [{}] if experiment.config.kind in ("transmittance", "amortise") else values:
             identity = {"grid": point.values, "context": context}
             found.append(Job(len(found), _label(point.config, identity), identity, point.config))
     return found
@@ -93,6 +93,10 @@ def run_job(directory: RunDirectory, job: Job, say: Callable[[str], None]) -> No
         from dsfit.experiment.race import race
 
         data, arrays = race(job.config, job.identity, directory, say)
+    elif job.config.kind == "amortise":
+        from dsfit.experiment.amortise import amortise
+
+        data, arrays = amortise(job, directory, say)
     else:
         from dsfit.experiment.compare import compare
 

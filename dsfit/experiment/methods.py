@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from dsfit.context import Context
 from dsfit.errors import InputError
+from dsfit.experiment.amortised_method import amortised, check_amortised
 from dsfit.experiment.schema import Config, FittedMethod, HeuristicMixMethod, SingleMethod
 
 if TYPE_CHECKING:
@@ -138,6 +139,9 @@ def make_plan(method: Any, setting: Setting) -> Plan:
         return _single(method, setting)
     if method.kind == "heuristic_mix":
         return _mix(method, setting)
+    if method.kind == "amortised":
+        proposal, facts = amortised(method, setting.config)
+        return Plan([proposal], ["amortised"], fit=dict(facts))
     return _fitted(method, setting)
 
 
@@ -237,7 +241,7 @@ def structured_start(integrand: Any, context: Context, **options: Any) -> nn.Mod
     return StructuredProposal(integrand.bsdf, context, extra=extra, **options)
 
 
-def check_method(raw: RawConfig, index: int, method: Any) -> None:
+def check_method(raw: RawConfig, index: int, method: Any, config: Config) -> None:
     """Refuse names and combinations that only the library knows.
 
     Raises:
@@ -268,6 +272,8 @@ def check_method(raw: RawConfig, index: int, method: Any) -> None:
             heuristic(method.heuristic or "balance")
         except InputError as error:
             raise refuse(("heuristic",), f"{error.allowed} ({error.field})") from None
+    if method.kind == "amortised":
+        check_amortised(raw, index, method, config)
     if isinstance(method, FittedMethod):
         from dsfit.fit.objectives import objective_named
         from dsfit.fit.solvers import solver_named

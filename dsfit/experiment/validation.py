@@ -62,7 +62,7 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Experiment:
 def _anchor_paths(raw: RawConfig) -> None:
     """Paths are relative to the file that names them, or to the working directory when given by `--set`."""
 
-    def anchored(key: tuple[str, str], path: Any) -> Any:
+    def anchored(key: tuple[str | int, ...], path: Any) -> Any:
         if not isinstance(path, str) or not path or "\0" in path:
             return path  # refused later
         source = Path(raw.source(key))
@@ -70,6 +70,10 @@ def _anchor_paths(raw: RawConfig) -> None:
 
     if raw.lookup(("light", "path")) is not None:
         raw.data["light"]["path"] = anchored(("light", "path"), raw.lookup(("light", "path")))
+    methods = raw.lookup(("methods",))
+    for k, method in enumerate(methods if isinstance(methods, list) else []):
+        if isinstance(method, dict) and "file" in method:
+            method["file"] = anchored(("methods", k, "file"), method["file"])
     for key in ("saved", "user"):
         paths = raw.lookup(("check", key))
         if isinstance(paths, list):

@@ -66,6 +66,10 @@ class AmortisedProposal(Proposal):
         if bsdf.fiber.batch_shape:
             raise InputError("bsdf.fiber", tuple(bsdf.fiber.batch_shape), "a single fibre")
         self.defensive = as_number("defensive", defensive, 0.0, 1.0, open_low=True, open_high=True)
+        for size in hidden:
+            if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+                raise InputError("hidden", hidden, "integers >= 1")
+        self.register_buffer("fiber", fiber_numbers(bsdf))
         self.lobes = LobeMoments(bsdf)
         direct, scattered = azimuth_tables(bsdf, False), azimuth_tables(bsdf, True)
         laws: list[Azimuthal] = [*direct, *scattered, scattered[0], scattered[0]]
@@ -120,6 +124,13 @@ class AmortisedProposal(Proposal):
             parts.append(ProductDistribution(context, lobe, law(context)))
         share = torch.full_like(shape.log_weights[..., :1], math.log(self.defensive))
         return MixtureDistribution([*parts, self.sphere(context)], torch.cat([shape.log_weights, share], dim=-1))
+
+
+def fiber_numbers(bsdf: DualScattering) -> Tensor:
+    """All numbers of a fibre and the density factors in one row, float64: what two BSDFs have to share for one
+    proposal to serve both."""
+    numbers = [*bsdf.fiber.parameters().values(), bsdf.d_f, bsdf.d_b]
+    return torch.cat([x.detach().to(torch.float64).reshape(-1) for x in numbers])
 
 
 _FEATURES = 10

@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor, nn
 
+from dsfit.proposals.parameters import Constrained
+
 
 def soft(x: Tensor) -> Tensor:
     """x / sqrt(1 + x^2): smooth, odd, bounded by 1; one reciprocal root, so several times cheaper than tanh."""
@@ -34,6 +36,10 @@ class Network(nn.Module):
             drawn = torch.randn(outputs, inputs, generator=generator, dtype=torch.float64) / math.sqrt(inputs)
             self.weights.append(nn.Parameter(torch.zeros_like(drawn) if last else drawn))
             self.biases.append(nn.Parameter(torch.zeros(outputs, dtype=torch.float64)))
+
+    def own_constrained(self) -> Constrained:
+        """Weights and biases, without bounds."""
+        return {name: (value, -math.inf, math.inf) for name, value in self.named_parameters()}
 
     def forward(self, x: Tensor) -> Tensor:
         """Values at features `[..., inputs]`, in their dtype."""

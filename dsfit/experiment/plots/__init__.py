@@ -41,6 +41,11 @@ def _figures(directory: RunDirectory, result: dict[str, Any]) -> Iterator[tuple[
 
         yield "race", race(result)
         return
+    if result["kind"] == "amortise":
+        from dsfit.experiment.plots.amortise import amortise
+
+        yield "amortised", amortise(directory, result)
+        return
     yield "convergence", convergence(result)
     yield "excess", excess_bars(result)
     if result["kind"] == "sweep" and (grid := excess_grid(result)) is not None:

@@ -14,10 +14,11 @@ from dsfit.context import Context
 from dsfit.errors import InputError, as_number
 from dsfit.fit.amortise.excess import all_excesses, excess_at
 from dsfit.fit.amortise.targets import Targets, make_targets
-from dsfit.proposals.amortised import AmortisedProposal
+from dsfit.proposals.amortised import AmortisedProposal, fiber_numbers
 from dsfit.streams import ContextStream
 
-TRAINING = ContextStream(theta="angle", rule="mixed", direct=0.2, n_mean=15.0)
+TRAINING = ContextStream(theta="angle", theta_max=math.radians(89.8), rule="mixed", direct=0.2, n_mean=15.0)
+"""Uniform in theta_r and nearly so in n to 30, v of every kind: what a renderer may meet, and a little beyond."""
 STEPS = 1000
 _RATE, _LAST_RATE, _WARM = 1e-2, 1e-5, 30
 _BATCH = 24
@@ -87,18 +88,16 @@ def amortise(
         scale: excess below which contexts no longer count much.
 
     Raises:
-        InputError: an eccentric fibre or a batch of fibres, both `seconds` and `steps`, or one out of range.
+        InputError: an eccentric fibre or a batch of fibres, a `start` of another fibre, both `seconds` and `steps`, or
+            a number out of range.
     """
-    if not bsdf.fiber.is_round:
-        raise InputError("bsdf.fiber.eccentricity", bsdf.fiber.eccentricity.tolist(), "a round fibre (eccentricity 1)")
+    _check(bsdf, stream, start, inclinations=(inclinations, 1), pairs=(pairs, 1), seed=(seed, 0))
     if seconds is not None and steps is not None:
         raise InputError("seconds, steps", (seconds, steps), "one of them")
     limit = math.inf if seconds is None else as_number("seconds", seconds, 0.0)
     steps = STEPS if steps is None and seconds is None else steps
-    counts = {"inclinations": inclinations, "pairs": pairs, **({} if steps is None else {"steps": steps})}
-    for name, value in counts.items():
-        if isinstance(value, bool) or not isinstance(value, int) or value < (0 if name == "steps" else 1):
-            raise InputError(name, value, "an integer >= " + ("0" if name == "steps" else "1"))
+    if steps is not None:
+        _check_count("steps", steps, 0)
     scale = as_number("scale", scale, 0.0, open_low=True)
     began = time.perf_counter()
     if start is None:
@@ -116,6 +115,28 @@ def amortise(
     return Amortised(proposal.requires_grad_(False), spent, done, inclinations * pairs, excess, history)
 
 
+def _check(bsdf: DualScattering, stream: ContextStream, start: object, **counts: tuple[int, int]) -> None:
+    if not isinstance(bsdf, DualScattering):
+        raise InputError("bsdf", type(bsdf).__name__, "a dsfit DualScattering")
+    if not bsdf.fiber.is_round:
+        raise InputError("bsdf.fiber.eccentricity", bsdf.fiber.eccentricity.tolist(), "a round fibre (eccentricity 1)")
+    if not isinstance(stream, ContextStream):
+        raise InputError("stream", stream, "a dsfit ContextStream")
+    if start is not None and not isinstance(start, AmortisedProposal):
+        raise InputError("start", type(start).__name__, "an AmortisedProposal")
+    if start is not None and not torch.equal(start.fiber.double(), fiber_numbers(bsdf)):
+        raise InputError(
+            "start", start.fiber.tolist(), f"a proposal of the BSDF's fibre, {fiber_numbers(bsdf).tolist()}"
+        )
+    for name, (value, low) in counts.items():
+        _check_count(name, value, low)
+
+
+def _check_count(name: str, value: object, low: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or value < low:
+        raise InputError(name, value, f"an integer >= {low}")
+
+
 def training_contexts(stream: ContextStream, inclinations: int, pairs: int, generator: torch.Generator) -> Context:
     """Contexts `[inclinations, pairs]` of a stream that share theta_r along their rows."""
     theta_r = stream.draw(inclinations, generator).theta_r
@@ -125,6 +146,7 @@ def training_contexts(stream: ContextStream, inclinations: int, pairs: int, gene
     return Context(theta_r[:, None], 0.0, n, v)
 
 
+@torch.enable_grad()
 def _train(
     proposal: AmortisedProposal,
     targets: Targets,
