@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -21,6 +21,10 @@ from dsfit.scene.planning.choice import Choice, choose
 from dsfit.scene.planning.exact import exact_reasons, fade_is_over, why_no_bound
 from dsfit.scene.planning.surroundings import arrival, radiance
 from dsfit.scene.planning.terms import NAMES, TREATMENTS, bound_terms
+
+if TYPE_CHECKING:
+    from dsfit.proposals.base import Proposal
+    from dsfit.scene.plan_proposal import Pruned
 
 Key = tuple[str, str]
 
@@ -86,6 +90,14 @@ class Plan:
         """Names of the lobes that a structured or amortised proposal needs."""
         lobes = [name if half == "direct" else f"{name}_scattered" for half, name in self.kept if name != "back"]
         return (*lobes, *(["back"] if any(name == "back" for _, name in self.kept) else []))
+
+    def prune(self, proposal: Proposal, context: Context, **options: Any) -> Pruned:
+        """A mixture without the lobes of what went and without what does not pay; see `plan_proposal.prune`."""
+        from dsfit.scene.plan_proposal import prune
+
+        lobes = {f"{name}{tail}" for name in ("R", "TT", "TRT") for tail in ("", "_scattered")} | {"back"}
+        gone = lobes - set(self.components)
+        return prune(proposal, self.integrand, context, needed=lambda name: name not in gone, **options)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data, for result files."""

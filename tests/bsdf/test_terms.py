@@ -68,7 +68,7 @@ def test_without_glint() -> None:
     torch.testing.assert_close(a, b, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("precision", ["exact", "table"])
+@pytest.mark.parametrize("precision", ["exact", pytest.param("table", marks=pytest.mark.slow)])
 def test_grey(precision: str) -> None:
     """One channel stands for all: F, averages, shares and azimuths keep their shape and value to 1e-15."""
     fiber = dsfit.Fiber.preset("blond", sigma_a=torch.tensor([0.1, 0.1, 0.1], dtype=F64))

@@ -77,7 +77,7 @@ def violations(bounds: TermBounds, truth: Tensor) -> list[str]:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_every_term_is_between_its_bounds(seed: int) -> None:
-    """Eight terms, two channels, below and above: 384 bounds; `test_many` has 12,800."""
+    """Eight terms, two channels, below and above: 384 bounds; `test_many` has 3200."""
     g = torch.Generator().manual_seed(seed)
     bsdf, context = random_bsdf(g), random_context(g)
     assert violations(bounds_of(bsdf, context), direct_and_means(bsdf, context)) == []
@@ -142,11 +142,11 @@ def _treated_energy(bsdf: dsfit.DualScattering, theta_diff: Tensor) -> Tensor:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("block", range(10))
+@pytest.mark.parametrize("block", range(5))
 def test_many(block: int) -> None:
-    """400 random fibres and contexts, eight terms, two channels."""
+    """100 random fibres and contexts, eight terms, two channels: 3200 bounds."""
     g = torch.Generator().manual_seed(1000 + block)
-    for _ in range(40):
+    for _ in range(20):
         bsdf, context = random_bsdf(g), random_context(g)
         assert violations(bounds_of(bsdf, context), direct_and_means(bsdf, context)) == []
 
@@ -171,14 +171,16 @@ def test_a_wrong_bound_is_noticed(wrong: str, monkeypatch: pytest.MonkeyPatch) -
             terms_module._Cells, "gauss", lambda self, c, s: original(self, c, Interval(s.low * 0.7, s.high * 0.7))
         )
     g = torch.Generator().manual_seed(5)
-    caught = 0
+    caught = False
     for _ in range(3):
         bsdf, context = random_bsdf(g), random_context(g)
         bounds = bounds_of(bsdf, context)
         if wrong == "a tenth":
             bounds = TermBounds(bounds.upper / 10, bounds.peak, bounds.kept)
-        caught += bool(violations(bounds, direct_and_means(bsdf, context)))
-    assert caught >= 1
+        caught = bool(violations(bounds, direct_and_means(bsdf, context)))
+        if caught:
+            break
+    assert caught
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -208,13 +210,13 @@ def test_table_is_bounded_by_itself() -> None:
 
 def test_what_the_treatment_of_the_caustic_changes() -> None:
     """|treated - raw| of TRT, in the integral and its absolute value, stays below the bound."""
-    for theta_r, eta in ((0.2, 1.55), (1.4, 1.55), (0.5, 1.8)):
+    for theta_r, eta in ((0.2, 1.55), (1.4, 1.8)):
         fiber = dsfit.Fiber.preset("blond", eta=eta)
         treated = dsfit.DualScattering(fiber).replace(terms=Terms(("TRT",), ()))
         context = dsfit.Context(theta_r)
         change = bounds_of(dsfit.DualScattering(fiber), context).upper[0, 8]
-        a = dsfit.reference(dsfit.Integrand(treated), context, 1e-4).value
-        b = dsfit.reference(dsfit.Integrand(treated.replace(terms=Terms(("TRT",), (), glint=False))), context, 1e-4)
+        a = dsfit.reference(dsfit.Integrand(treated), context, 1e-3).value
+        b = dsfit.reference(dsfit.Integrand(treated.replace(terms=Terms(("TRT",), (), glint=False))), context, 1e-3)
         assert bool(((a - b.value).abs() <= change).all())
 
 
@@ -258,7 +260,7 @@ def test_a_ball_is_bounded_too() -> None:
     ball = SphereScattering(1.0, 0.6, (0.2, 0.3, 0.0))
     context = dsfit.Context(0.4)
     bounds = bound_terms(bsdf, Boxes.around(context), arrival(ball))
-    value = dsfit.reference(dsfit.Integrand(bsdf, scattering=ball), context, 1e-3).value
+    value = dsfit.reference(dsfit.Integrand(bsdf, scattering=ball), context, 1e-2).value
     assert bool((bounds.kept[-1, 0] <= value).all()) and bool((value <= bounds.upper[0, :8].sum(0)).all())
     assert bool((bounds.kept[-1, 0] > 0.1 * value).all())
 
