@@ -21,7 +21,9 @@ _PUBLIC = {
     "Convention": "dsfit.bsdf",
     "DualScattering": "dsfit.bsdf",
     "Estimate": "dsfit.mis",
+    "FamilyProposal": "dsfit.proposals.family",
     "Fiber": "dsfit.bsdf",
+    "FiberFamily": "dsfit.proposals.fiber_family",
     "Fit": "dsfit.fit",
     "HeldOut": "dsfit.fit.amortise",
     "InputError": "dsfit.errors",
@@ -39,6 +41,7 @@ _PUBLIC = {
     "quadrature_nodes": "dsfit.quality",
     "reference": "dsfit.quality",
     "save_proposal": "dsfit.experiment",
+    "train_family": "dsfit.fit.amortise.family",
 }
 
 __all__ = sorted(_PUBLIC)
