@@ -30,6 +30,8 @@ def seconds(value: float) -> str:
     value = number(value)
     if math.isnan(value) or math.isinf(value):
         return "-" if math.isnan(value) else "never"
+    if 600 <= value < 7200:
+        return f"{value / 60:.3g} min"
     if value >= 7200:
         return f"{value / 86400:.3g} days" if value >= 172800 else f"{value / 3600:.3g} h"
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
@@ -45,7 +47,12 @@ def _span(reading: dict[str, Any]) -> str:
     if reading["how"] == "never" or not (math.isfinite(low) and math.isfinite(high)) or high <= low * 1.005:
         return text
     size = value / float(seconds(value).split()[0])
-    return f"{text} [{low / size:.2g}, {high / size:.2g}]"
+    return f"{text} [{_two(low / size)}, {_two(high / size)}]"
+
+
+def _two(value: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{value:.2g}" if value < 100 else f"{float(f'{value:.2g}'):.0f}"
 
 
 def _ratio(value: float) -> str:

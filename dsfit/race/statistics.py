@@ -11,11 +11,11 @@ from torch import Tensor
 
 LEVEL = 0.95
 HEAVY = 0.5
-"""Share of the sum of squares from which on a single estimate decides and the error counts as heavy-tailed; more among
-few estimates, where the largest of normal errors may have as much once in a thousand times."""
+"""Share of the sum of squares from which on a single one of many estimates decides and the error counts as
+heavy-tailed."""
 _CENTRED = 0.01
 _TEST_SHARE = 0.2
-_FEWEST = 8
+_FEWEST, _MANY = 8, 32
 _CHANCE = 1e-3
 
 
@@ -40,7 +40,7 @@ class Rmse:
     @property
     def heavy(self) -> bool:
         """Whether a single estimate makes up most of the sum, among enough of them to tell."""
-        return self.count >= _FEWEST and self.top_share > _largest_share(self.count, HEAVY)
+        return self.count >= _MANY and self.top_share > HEAVY
 
     def to_dict(self) -> dict[str, Any]:
         """As plain data."""
