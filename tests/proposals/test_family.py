@@ -149,7 +149,7 @@ def test_moments_agree_with_those_of_the_amortised_proposal(monkeypatch: pytest.
 
 def test_untrained_it_is_near() -> None:
     """The tables alone, without a network's correction."""
-    bsdf = dsfit.DualScattering(dsfit.Fiber(**FIBERS["round"]), precision="table")
+    bsdf = QuickScattering(bsdf_of("round"))
     member = FamilyProposal().of(bsdf)
     context = Context(torch.tensor([-0.6], dtype=torch.float64), 0.0, 5.0)
     nodes = dsfit.quadrature_nodes(dsfit.Integrand(bsdf), context[0], 1e-3)
