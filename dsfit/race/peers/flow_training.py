@@ -16,6 +16,7 @@ from dsfit.random import uniforms
 
 _CONTEXTS, _DIRECTIONS = 256, 64
 _BATCH, _POOL = 2048, 2**18
+_USES = 8  # least number of times that a direction of the pool is used, as long as the pool may grow
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def train(
         The loss of every step. The pool's time counts as well.
     """
     start = time.perf_counter()
-    pool = draw_pool(problem, min(_POOL, max(1, steps) * _BATCH), generator)
+    pool = draw_pool(problem, min(_POOL, steps * _BATCH // _USES), generator)
     optimizer = torch.optim.Adam(proposal.parameters(), lr=rate)
     losses: list[float] = []
     for step in range(steps):
