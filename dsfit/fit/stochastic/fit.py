@@ -153,6 +153,8 @@ def fit_stochastic(
     spent += time.perf_counter() - began
     kept = {"setting": setting.state(), "run": run.state(), "history": history, "seconds": spent}
     context, drawn = _last(setting, held_out)
+    if not setting.lit:
+        raise InputError("integrand", 0.0, "radiance that is not zero at every sample")
     run.judge(drawn)
     found = _judged(setting, context, drawn)
     last = _progress(len(history), setting, found, spent)

@@ -119,7 +119,7 @@ class GaussNewtonRun:
     def judge(self, drawn: Draws) -> None:
         """Take the last step back if fresh samples find it harmful, and note whether they see progress."""
         if torch.equal(self.y, self.before):
-            self.stalled += len(self.replay) > 0
+            self.stalled += len(self.replay.batches) > 1
             return
         mean, error = improvement(drawn, self._log_p(self.before, drawn), self._log_p(self.y, drawn))
         self.stalled = 0 if mean > error else self.stalled + 1
@@ -132,6 +132,8 @@ class GaussNewtonRun:
         self.replay.add(drawn, self.setting.parameters.vector(self.setting.work))
         self.judge(drawn)
         drawn = self.replay.draws()
+        if not bool((drawn.log_square > -math.inf).any()):
+            return
         problem = self._problem(drawn)
         limits = {"max_steps": self.options.inner, "tolerance": 1e-4, "reach": REACH}
         self.fitted = minimise(problem, self.fitted, "optimistix.lm", **limits, **NATURAL).y
@@ -158,8 +160,6 @@ class GaussNewtonRun:
         count = len(drawn.omega)
         log_moment = self._log_moment(self.y, drawn)
         seen = log_moment > -math.inf
-        if not bool(seen.any()):
-            raise InputError("integrand", 0.0, f"radiance that is not zero at all of {count} samples")
         share = 1.0 / int(seen.sum())
         log_best = 0.5 * (drawn.log_square - torch.where(seen, log_moment, 0.0))
         weight = torch.exp(-drawn.log_q) / count

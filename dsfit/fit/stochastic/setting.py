@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -45,6 +46,7 @@ class Setting:
         draws: of the integrand per direction, see `samples`.
         generator: the only source of randomness but for the integrand's own.
         evaluations: so far.
+        lit: whether any answer so far was not zero.
     """
 
     work: nn.Module
@@ -56,6 +58,7 @@ class Setting:
     draws: int
     generator: torch.Generator
     evaluations: int = 0
+    lit: bool = False
     parameters: Parameters = field(init=False)
 
     def __post_init__(self) -> None:
@@ -74,6 +77,7 @@ class Setting:
         count = self.samples if count is None else count
         drawn = draw(self.radiance, context, law, count, self.generator, draws=self.draws)
         self.evaluations += drawn.evaluations
+        self.lit = self.lit or bool((drawn.log_square > -math.inf).any())
         return drawn
 
     def state(self) -> dict[str, Any]:
@@ -82,10 +86,11 @@ class Setting:
             "y": self.parameters.vector(self.work),
             "generator": self.generator.get_state(),
             "evaluations": self.evaluations,
+            "lit": self.lit,
         }
 
     def load(self, state: dict[str, Any]) -> None:
         """Go on from there."""
         self.parameters.assign(self.work, state["y"])
         self.generator.set_state(state["generator"])
-        self.evaluations = state["evaluations"]
+        self.evaluations, self.lit = state["evaluations"], state["lit"]
