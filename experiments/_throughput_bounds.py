@@ -9,15 +9,19 @@ def bounds(machine: dict[str, Any], count: dict[str, float]) -> dict[str, float]
     """Seconds per direction that each resource takes on one core, from what was counted and what was measured.
 
     Roots and quotients at the rate of divisions; everything else that is counted at the rate of multiply-adds;
-    gathers from tables of 512 KiB; bytes of arguments and results from memory.
+    cache lines from tables of 8 MiB, or, where a kernel reads none, numbers gathered one by one; bytes of arguments and
+    results from memory.
     """
-    compiled, gather = machine["compiled"], machine["gather"].get("compiled", machine["gather"]["eager"])
+    compiled, gather = machine["compiled"], machine["gather"]
+    single, lines = gather.get("compiled", gather["eager"]), gather["lines"]
+    looked_up = "lines" if count.get("lines") else "gathers"
     rate = {
         "transcendentals": compiled.get("exp", machine["eager"]["exp"]),
         "roots and quotients": compiled.get("divide", machine["eager"]["sqrt"]),
-        "gathers": gather.get("512 KiB", max(gather.values())),
+        looked_up: lines.get("8 MiB", max(lines.values())) if looked_up == "lines" else max(single.values()),
         "other": compiled.get("multiply-add", machine["eager"]["multiply"]),
         "least bytes": machine["copy"]["memory"],
         "multiply-adds of matrices": machine["matrix"],
     }
-    return {name: count.get(name, 0.0) / speed for name, speed in rate.items()}
+    times = {name: count.get(name, 0.0) / speed for name, speed in rate.items()}
+    return {"look-ups" if name == looked_up else name: seconds for name, seconds in times.items()}

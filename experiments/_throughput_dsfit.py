@@ -21,14 +21,10 @@ from dsfit.streams import ContextStream
 SHARED = 16
 """Samples of a context in the layout where contexts are shared."""
 LAYOUTS = {"all different": 1, f"{SHARED} a context": SHARED}
-MOST_FLOAT64 = 100_000
-"""Directions that the float64 path is timed with at most: more take seconds a call."""
-PARTS = {
-    "eval, direct only": Terms(scattered=()),
-    "eval, scattered only": Terms(direct=()),
-    "eval, no back": Terms(direct=("R", "TT", "TRT"), scattered=("R", "TT", "TRT")),
-    "eval, direct TRT only": Terms(direct=("TRT",), scattered=()),
-}
+MOST = {"float64": 10_000, "kernel, eager": 100_000, "contexts": 30_000}
+"""Directions that the slower ones are timed with at most, and contexts that are prepared at once: more take seconds a
+call and change no rate."""
+PARTS = {"eval, direct only": Terms(scattered=()), "eval, scattered only": Terms(direct=())}
 """The kernels of some terms, for the cost of each."""
 
 
@@ -50,15 +46,17 @@ class Library:
     def contenders(self, count: int, layout: str, seed: int = 1) -> list[Contender]:
         """Every task that is timed for `count` directions in this layout."""
         work = _Work(count, LAYOUTS[layout], seed)
-        found = [c for name, kernel in self.kernels.items() for c in _of_kernel(name, kernel, work, layout)]
-        for task, kernel in self.parts.items():
-            contexts = kernel.prepare(*work.single)
-            run = _bound(kernel.eval, contexts, work.theta_i, work.phi)
-            found.append(Contender(self.fastest, task, layout, work.count, run))
+        found = []
+        for name, kernel in self.kernels.items():
+            if count <= MOST.get(name, count):
+                found += _of_kernel(name, kernel, work, layout)
         if layout == "all different":
+            for task, kernel in self.parts.items():
+                run = _bound(kernel.eval, kernel.prepare(*work.single), work.theta_i, work.phi)
+                found.append(Contender(self.fastest, task, layout, work.count, run))
             vector = torch.nn.functional.normalize(torch.randn(count, 3, generator=work.generator), dim=-1)
             found.append(Contender("torch", "to_angles", layout, count, _bound(to_angles, vector)))
-        if count <= MOST_FLOAT64:
+        if count <= MOST["float64"]:
             found += self._float64(work, layout)
         return found
 
@@ -115,10 +113,12 @@ def _of_kernel(name: str, kernel: HairKernel, work: _Work, layout: str) -> list[
         "prepare + eval": lambda: kernel.eval(kernel.prepare(*work.single), *directions),
         "prepare + fused": lambda: kernel.sample_eval(kernel.prepare(*work.single), u),
     }
-    counts = {"prepare": work.shape[1]}
-    return [
-        Contender(name, task, layout, counts.get(task, work.count), _without_grad(run)) for task, run in runs.items()
-    ]
+    found = []
+    for task, run in runs.items():
+        if not task.startswith("prepare") or work.shape[1] <= MOST["contexts"]:
+            count = work.shape[1] if task == "prepare" else work.count
+            found.append(Contender(name, task, layout, count, _without_grad(run)))
+    return found
 
 
 def _bound(function: Callable[..., Any], *arguments: Any) -> Callable[[], object]:

@@ -10,6 +10,7 @@ from _throughput_counts import counted, least_bytes
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
+from dsfit.race.machine import LINE
 from dsfit.streams import ContextStream
 
 _SAMPLES, _BATCH = 16, 256
@@ -27,7 +28,18 @@ def counts(library: Any) -> dict[str, dict[str, float]]:
         results = outputs if isinstance(outputs, tuple) else (outputs,)
         tensors = tuple(x for x in results if isinstance(x, Tensor))
         found[task]["least bytes"] = least_bytes(inputs, tensors, directions)
+        found[task]["lines"] = float(_lines(kernel, task))
     return found
+
+
+def _lines(kernel: Any, task: str) -> int:
+    """Cache lines of tables that the compiled form reads per direction: records at the four corners of a cell, two
+    rows of averages; what a bisection in a table of azimuths reads comes on top of that."""
+    if task in ("prepare", "sample"):
+        return 0
+    layout = kernel._program("both").layout
+    averages = 0 if task == "log_prob" else -(-5 * layout.channels // LINE)
+    return 4 * (layout.width // LINE) + 2 * averages
 
 
 def _tasks(kernel: Any) -> dict[str, tuple[Callable[[], Any], tuple[Tensor, ...], int]]:

@@ -24,6 +24,16 @@ def index(data: dict[str, Any]) -> dict[KEYS, dict[str, Any]]:
     }
 
 
+def clock(row: dict[str, Any]) -> dict[str, float]:
+    """Seconds of a call: on the processor for one thread, which others hardly disturb, else wall time."""
+    return row["processor"] if row["threads"] == 1 else row["wall"]
+
+
+def rate(row: dict[str, Any], which: str = "median") -> float:
+    """Million directions per second."""
+    return row["count"] / max(clock(row)[which], 1e-12) / 1e6
+
+
 def _asked(row: dict[str, Any]) -> int:
     return 10 ** round(float(np.log10(max(row["count"], 1)))) if row["task"] != "prepare" else row["count"]
 
@@ -47,7 +57,8 @@ def _heading(data: dict[str, Any]) -> str:
         f"(1 is one busy core); {data['seconds']:.0f} s. Mitsuba {theirs['version']}, {theirs['variant']} "
         f"({theirs['reason']}). Kernels: "
         + "; ".join(f"{name}: {backend}" for name, backend in data.get("backends", {}).items())
-        + ". Million directions per second: median (10-90 %); ratio to Mitsuba for the same directions and threads."
+        + ". Million directions per second, of processor time for one thread, of wall time for two: median (10-90 %), "
+        "and the ratio to Mitsuba for the same directions and threads."
     )
 
 
@@ -71,10 +82,9 @@ def _cell(data: dict, rows: dict, library: str, task: str, layout: str, threads:
     row = rows.get((library, task, layout, count, threads))
     if row is None:
         return ""
-    low, high = row["count"] / row["seconds_90"] / 1e6, row["count"] / row["seconds_10"] / 1e6
-    text = f"{row['per_second'] / 1e6:.3g} ({low:.3g}-{high:.3g})"
+    text = f"{rate(row):.3g} ({rate(row, 'high'):.3g}-{rate(row, 'low'):.3g})"
     base = _base(data, rows, task, count, threads)
-    return text if base is None or base is row else f"{text} x{row['per_second'] / base['per_second']:.2f}"
+    return text if base is None or base is row else f"{text} x{rate(row) / rate(base):.2f}"
 
 
 def _base(data: dict, rows: dict, task: str, count: int, threads: int) -> dict[str, Any] | None:
@@ -93,7 +103,7 @@ def _terms(data: dict[str, Any]) -> str:
     lines = ["| kernel, compiled, one thread | contexts | ns per direction (prepare: per context) |", "|---|---|---:|"]
     for row in rows:
         if row["count"] == largest or (row["task"] == "prepare" and row["count"] >= largest / 16):
-            lines.append(f"| {row['task']} | {row['layout']} | {1e9 * row['seconds'] / row['count']:.1f} |")
+            lines.append(f"| {row['task']} | {row['layout']} | {1e3 / rate(row):.1f} |")
     return "\n".join(lines)
 
 
@@ -106,6 +116,7 @@ def _limits(data: dict[str, Any]) -> str:
              "|---|" + "---:|" * (len(names) + 2)]  # fmt: skip
     for task, count in counts.items():
         found = bounds(data["machine"], count)
+        count = {**count, "look-ups": count.get("lines") or count.get("gathers", 0)}
         cells = [f"{count.get(name, 0):.3g}, {1e9 * found[name]:.2g}" for name in names]
         lines.append(f"| {task} | " + " | ".join(cells) + f" | {1e9 * sum(found.values()):.3g} | "
                      f"{_measured(data, task):.3g} |")  # fmt: skip
@@ -115,7 +126,7 @@ def _limits(data: dict[str, Any]) -> str:
 def _measured(data: dict[str, Any], task: str) -> float:
     """Nanoseconds per direction of the compiled kernel at the count that suits it best; nan if it was not timed."""
     found = [
-        1e9 * row["seconds"] / row["count"]
+        1e3 / rate(row)
         for row in data["rows"]
         if (row["library"], row["task"], row["threads"]) == ("kernel, compiled", task, 1)
     ]
@@ -134,13 +145,11 @@ def figure(data: dict[str, Any], folder: Path) -> list[Path]:
         return save(sheet, folder, "throughput")
 
 
-def _shown(data: dict[str, Any]) -> int:
-    """The largest number of directions that all libraries were timed with."""
-    counts = {row["library"]: set() for row in data["rows"] if row["library"] in LIBRARIES and row["threads"] == 1}
-    for row in data["rows"]:
-        if row["library"] in counts and row["task"] == "eval" and row["layout"] == "all different":
-            counts[row["library"]].add(_asked(row))
-    return max(set.intersection(*(found for found in counts.values() if found)))
+def _best(data: dict[str, Any], library: str, task: str, layout: str, threads: int = 1) -> dict[str, Any] | None:
+    """The row with the number of directions that suits it best."""
+    key = (library, task, layout, threads)
+    rows = [row for row in data["rows"] if (row["library"], row["task"], row["layout"], row["threads"]) == key]
+    return max(rows, key=rate, default=None)
 
 
 def _libraries(data: dict[str, Any]) -> list[str]:
@@ -153,15 +162,14 @@ def _layout(library: str) -> str:
 
 
 def _bars(axis: Axes, data: dict[str, Any]) -> None:
-    rows, count, libraries = index(data), _shown(data), _libraries(data)
+    libraries = _libraries(data)
     width = 0.8 / len(libraries)
     for k, library in enumerate(libraries):
         for j, task in enumerate(TASKS):
-            row = rows.get((library, task, _layout(library), count, 1))
+            row = _best(data, library, task, _layout(library))
             if row is None:
                 continue
-            value = row["per_second"] / 1e6
-            ends = [row["count"] / row[key] / 1e6 for key in ("seconds_90", "seconds_10")]
+            value, ends = rate(row), [rate(row, key) for key in ("high", "low")]
             at = j + (k - (len(libraries) - 1) / 2) * width
             label = LABELS.get(library, library) if j == 0 else None
             axis.bar(at, value, width, color=COLORS[k], label=label,
@@ -170,7 +178,7 @@ def _bars(axis: Axes, data: dict[str, Any]) -> None:
     axis.set_xticks(range(len(TASKS)), list(TASKS.values()))
     axis.set_yscale("log")
     axis.set_ylabel("million directions / s, one core")
-    axis.set_title(f"{count:,} directions, a context each (prepared before)")
+    axis.set_title("each direction its own context, prepared before; best number of directions")
     axis.margins(y=0.12)
     axis.legend(frameon=False, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.1))
 
@@ -179,54 +187,60 @@ def _curves(axis: Axes, data: dict[str, Any]) -> None:
     for k, library in enumerate(_libraries(data)):
         for task, line in (("eval", "-"), ("fused", "--")):
             rows = sorted(
-                (row["count"], row["per_second"] / 1e6)
+                (row["count"], rate(row))
                 for row in data["rows"]
                 if (row["library"], row["task"], row["threads"], row["layout"]) == (library, task, 1, _layout(library))
             )
             if rows:
-                label = f"{LABELS.get(library, library)}, {task}"
+                label = LABELS.get(library, library) if task == "eval" else None
                 axis.plot(*zip(*rows, strict=True), line, color=COLORS[k], marker=MARKERS[k], markersize=4, label=label)
     axis.set_xscale("log")
     axis.set_yscale("log")
     axis.set_xlabel("directions per call")
     axis.set_ylabel("million directions / s, one core")
     axis.grid(True)
-    axis.legend(frameon=False, fontsize=6.5)
+    axis.set_title("solid: eval; dashed: sample + pdf + eval")
+    axis.legend(frameon=False, fontsize=7, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.18))
 
 
 def _ratios(axis: Axes, data: dict[str, Any]) -> None:
-    """Of the compiled kernel to Mitsuba, by task, layout and threads, where each is fastest among shared counts."""
-    rows, count = index(data), max(_asked(row) for row in data["rows"] if row["library"] == mitsuba(data))
-    threads = sorted({row["threads"] for row in data["rows"]})
-    kinds = [(t, layout) for t in threads for layout in ("all different", "16 a context")]
+    """Of the compiled kernel to Mitsuba, by task, layout and threads, each for the most directions that both did."""
+    rows = index(data)
+    seen = {(row["threads"], row["layout"]) for row in data["rows"] if row["library"] == "kernel, compiled"}
+    kinds = sorted(seen, key=lambda kind: (kind[0], kind[1] != "all different"))
     tasks = ["eval", "log_prob", "sample", "fused", "prepare + eval", "prepare + fused"]
     for k, (thread, layout) in enumerate(kinds):
         for j, task in enumerate(tasks):
-            row = rows.get(("kernel, compiled", task, layout, count, thread))
-            base = _base(data, rows, task, count, thread)
-            if row is None or base is None:
+            both = [
+                (row, base)
+                for key, row in rows.items()
+                if key[:3] == ("kernel, compiled", task, layout) and key[4] == thread
+                if (base := _base(data, rows, task, key[3], thread)) is not None
+            ]
+            if not both:
                 continue
-            value = row["per_second"] / base["per_second"]
+            row, base = max(both, key=lambda pair: pair[0]["count"])
+            value = rate(row) / rate(base)
             label = f"{thread} thread{'s' if thread > 1 else ''}, {layout}" if j == 0 else None
             axis.bar(j + (k - (len(kinds) - 1) / 2) * 0.2, value, 0.2, color=COLORS[k], label=label)
     axis.axhline(1.0, color="black", linewidth=0.8)
     names = [TASKS.get(task, task).replace(" + ", " +\n") for task in tasks]
     axis.set_xticks(range(len(tasks)), names, fontsize=7)
     axis.set_ylabel("compiled kernel / Mitsuba")
-    axis.set_title(f"{count:,} directions; above 1 the kernel is faster")
-    axis.legend(frameon=False, fontsize=7)
+    axis.set_title("above 1 the kernel is faster; most directions that both did")
+    axis.legend(frameon=False, fontsize=7, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
 
 
 def _roofline(axis: Axes, data: dict[str, Any]) -> None:
     counts = data.get("counts", {})
-    tasks = [task for task in ("eval", "log_prob", "sample", "fused", "prepare") if task in counts]
+    tasks = [task for task in TASKS if task in counts]
     for j, task in enumerate(tasks):
         bottom = 0.0
         for k, (name, seconds) in enumerate(bounds(data["machine"], counts[task]).items()):
             axis.bar(j - 0.2, 1e9 * seconds, 0.35, bottom=bottom, color=COLORS[k], label=name if j == 0 else None)
             bottom += 1e9 * seconds
         axis.bar(j + 0.2, _measured(data, task), 0.35, color="#444444", label="measured" if j == 0 else None)
-    axis.set_xticks(range(len(tasks)), tasks)
-    axis.set_ylabel("ns per direction (prepare: context), one core")
-    axis.set_title("compiled kernel: what its operations cost at this machine's rates")
+    axis.set_xticks(range(len(tasks)), [TASKS[task] for task in tasks])
+    axis.set_ylabel("ns per direction, one core")
+    axis.set_title("compiled kernel: limits by resource, and measured")
     axis.legend(frameon=False, fontsize=7)

@@ -45,9 +45,10 @@ class _Series:
 def measure(contenders: Sequence[Contender], seconds: float, least: int = 5) -> list[dict[str, Any]]:
     """Time all contenders in turn for `seconds` in all, or `least` rounds; a row of plain data for each.
 
-    A row holds seconds of the first call (which compiles or traces), and per call the median, the 10 and 90 %
-    quantiles and the least of the wall times, and the median of the processor times (over all threads), which a
-    busy machine disturbs less. The order rotates from round to round.
+    A row holds the seconds of the first call (which compiles or traces), and per call the median, the 10 and 90 %
+    quantiles and the least of the wall times ("wall") and of the times on processors, summed over threads
+    ("processor"): what others run meanwhile lengthens the first, and hardly the second. The order rotates from round to
+    round.
     """
     series = [_prepared(contender) for contender in contenders]
     start, done = time.perf_counter(), 0
@@ -79,21 +80,26 @@ def _one(series: _Series) -> None:
 
 
 def _row(series: _Series) -> dict[str, Any]:
-    contender, wall = series.contender, sorted(series.wall)
-    median = statistics.median(wall)
+    contender = series.contender
     return {
         "library": contender.library,
         "task": contender.task,
         "layout": contender.layout,
         "count": contender.count,
         "first_seconds": series.first,
-        "rounds": len(wall),
-        "seconds": median,
-        "seconds_10": quantile(wall, 0.1),
-        "seconds_90": quantile(wall, 0.9),
-        "seconds_best": wall[0],
-        "processor_seconds": statistics.median(series.processor),
-        "per_second": contender.count / median,
+        "rounds": len(series.wall),
+        "wall": _summary(series.wall),
+        "processor": _summary(series.processor),
+    }
+
+
+def _summary(seconds: Sequence[float]) -> dict[str, float]:
+    ordered = sorted(seconds)
+    return {
+        "median": statistics.median(ordered),
+        "low": quantile(ordered, 0.1),
+        "high": quantile(ordered, 0.9),
+        "least": ordered[0],
     }
 
 

@@ -1,6 +1,6 @@
 """Directions per second and core: dsfit's kernels against Mitsuba 3's `hair` BSDF, and against what the machine can do.
 
-    python experiments/throughput.py --out DIR [--quick]     (measures: under three minutes)
+    python experiments/throughput.py --out DIR [--quick]     (measures: three minutes, and compiling)
     python experiments/throughput.py --plot DIR              (figure and table of what was measured)
 
 Each number of threads gets a process of its own, bound to as many cores, in which all contenders run in turn. Writes
@@ -9,7 +9,8 @@ throughput.json, throughput.png, throughput.pdf and throughput.md.
 What is compared differs: `hair` is one fibre (four lobes in closed form, no scattering among fibres); dsfit evaluates
 Marschner's fibre with its roots and caustic, the same lobes widened by scattering, and back scattering, of 8 or 9
 components in the mixture that it draws from. Mitsuba takes unit vectors, dsfit angles: "to_angles" is what a
-conversion costs. Times are without compiling, and with the wait for the result.
+conversion costs. Times are without compiling, which the first run does, for minutes; later ones find the code on
+disk. They include the wait for the result.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def compute(folder: Path, quick: bool) -> dict[str, Any]:
     choice = mitsuba.choose()
     cores = sorted(os.sched_getaffinity(0))
     results = []
-    for threads in (1, 2)[: len(cores)]:
+    for threads in (1,) if quick else (1, 2)[: len(cores)]:
         job = {"threads": threads, "cores": cores[:threads], "quick": quick, "choice": dataclasses.asdict(choice)}
         results.append(_in_process(job))
     data = {
@@ -79,11 +80,12 @@ def work(job: dict[str, Any]) -> dict[str, Any]:
     choice = theirs.Choice(**job["choice"])
     mi = None if choice.variant is None else theirs.start(choice, threads)
     single = threads == 1
-    library = ours.Library(("compiled",) if not single else ("eager", "compiled"), parts=single)
+    library = ours.Library(("eager", "compiled") if single else ("compiled",), parts=single and not quick)
     rows = []
-    counts = QUICK_COUNTS if quick else COUNTS if single else COUNTS[2:]
-    for count in counts:
-        for layout in ours.LAYOUTS:
+    # Every shape and number of threads is compiled anew: two threads and quick runs do with one.
+    layouts = list(ours.LAYOUTS)[: 2 if single and not quick else 1]
+    for count in QUICK_COUNTS if quick else COUNTS if single else COUNTS[2:]:
+        for layout in layouts:
             contenders = library.contenders(count, layout)
             if mi is not None and layout == "all different":
                 contenders = theirs.contenders(mi, count) + contenders
@@ -103,7 +105,7 @@ def _limits(library: Any, quick: bool) -> dict[str, Any]:
     from dsfit.race.machine import probe
 
     return {
-        "machine": dataclasses.asdict(probe(0.02 if quick else 0.1)),
+        "machine": dataclasses.asdict(probe(0.02 if quick else 0.1, compiled=not quick)),
         "counts": limits.counts(library),
         "profile": limits.profiles(library),
         "backends": {name: str(kernel.backend) for name, kernel in library.kernels.items()},

@@ -20,6 +20,8 @@ TABLES = {"16 KiB": 4 << 10, "512 KiB": 128 << 10, "8 MiB": 2 << 20, "128 MiB": 
 """Float32 numbers in the tables that are gathered from."""
 UNROLL = 16
 """How often a compiled loop applies its operation to a number that it has loaded, so that memory does not matter."""
+LINE = 16
+"""Float32 numbers in a cache line."""
 
 _EAGER: dict[str, Callable[..., Tensor]] = {
     "exp": torch.exp,
@@ -41,7 +43,8 @@ class Machine:
         copy: bytes read and written by a copy, by level of memory.
         eager: float32 numbers through one torch operation, buffers in L2.
         compiled: float32 operations in a compiled loop that keeps them in registers; empty without a compiler.
-        gather: numbers gathered at random places, by size of the table: by torch ("eager"), in a compiled loop.
+        gather: numbers gathered at random places, by size of the table: by torch ("eager"), in a compiled loop; and
+            whole cache lines of 16 numbers ("lines"), by torch.
         matrix: multiply-adds of a large matrix product.
         note: why nothing was compiled, if so.
     """
@@ -74,6 +77,8 @@ def probe(seconds: float = 0.1, *, compiled: bool = True, tables: dict[str, int]
         product = torch.empty_like(square)
         machine.matrix = 1024**3 * _rate(lambda: torch.mm(square, square, out=product), seconds)
         machine.gather["eager"] = _gathers(lambda table, at: torch.index_select(table, 0, at), seconds, sizes)
+        lines = {name: max(size // LINE, 2) for name, size in sizes.items()}
+        machine.gather["lines"] = _gathers(lambda t, at: torch.index_select(t, 0, at), seconds, lines, LINE)
         if compiled:
             _compiled(machine, seconds, sizes)
     return machine
@@ -113,11 +118,14 @@ def _polynomial(x: Tensor) -> Tensor:
     return value
 
 
-def _gathers(take: Callable[[Tensor, Tensor], Tensor], seconds: float, tables: dict[str, int]) -> dict[str, float]:
+def _gathers(
+    take: Callable[[Tensor, Tensor], Tensor], seconds: float, tables: dict[str, int], width: int = 1
+) -> dict[str, float]:
     generator = torch.Generator().manual_seed(1)
     rates = {}
     for name, size in tables.items():
-        table, at = torch.rand(size, generator=generator), torch.randint(size, (1 << 16,), generator=generator)
+        table = torch.rand(*((size, width) if width > 1 else (size,)), generator=generator)
+        at = torch.randint(size, (1 << 16 if width == 1 else 1 << 12,), generator=generator)
         rates[name] = len(at) * _rate(lambda t=table, i=at: take(t, i), seconds)
     return rates
 
