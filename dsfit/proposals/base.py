@@ -171,6 +171,10 @@ class ProductDistribution(Distribution):
         self.dimension = 1 + azimuthal.dimension
         self.batch_shape = context.batch_shape
 
+    def with_longitudinal(self, longitudinal: LongitudinalDistribution) -> ProductDistribution:
+        """The same distribution with another law of theta_i."""
+        return ProductDistribution(self.context, longitudinal, self.azimuthal)
+
     def select(self, take: Callable[[Tensor], Tensor]) -> ProductDistribution | None:
         longitudinal, azimuthal = self.longitudinal.select(take), self.azimuthal.select(take)
         if longitudinal is None or azimuthal is None:

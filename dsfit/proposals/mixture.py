@@ -11,9 +11,12 @@ from torch import Tensor, nn
 from dsfit.arguments import check_directions, check_uniforms, checked
 from dsfit.context import Context
 from dsfit.errors import InputError, as_number, as_real, check_range
-from dsfit.proposals.base import Distribution, Proposal
+from dsfit.proposals.base import Distribution, ProductDistribution, Proposal
 from dsfit.proposals.parameters import Constrained
+from dsfit.proposals.split_lobe import SplitGaussianInclination, with_masses
 from dsfit.proposals.uniform import UniformSphere
+
+_FEW = 4096
 
 
 def log_sum_exp(x: Tensor) -> Tensor:
@@ -45,8 +48,19 @@ class MixtureDistribution(Distribution):
     def component_log_probs(self, omega: Tensor) -> Tensor:
         """log p_k `[..., K]` of every component."""
         with checked(check_directions(omega, self.batch_shape)):
-            parts = [component.log_prob(omega) for component in self.components]
+            parts = [component.log_prob(omega) for component in self._with_masses()]
         return torch.stack(torch.broadcast_tensors(*parts), dim=-1)
+
+    def _with_masses(self) -> list[Distribution]:
+        """The components; where contexts are few, those of split Gaussians get their masses together."""
+        components = list(self.components)
+        if self.batch_shape.numel() <= _FEW:
+            laws = {k: c.longitudinal for k, c in enumerate(components) if isinstance(c, ProductDistribution)}
+            split = {k: law for k, law in laws.items() if isinstance(law, SplitGaussianInclination)}
+            if len(split) > 1:
+                for k, law in zip(split, with_masses(list(split.values())), strict=True):
+                    components[k] = components[k].with_longitudinal(law)
+        return components
 
     def log_prob(self, omega: Tensor) -> Tensor:
         return log_sum_exp(self.component_log_probs(omega) + self.log_weights)
