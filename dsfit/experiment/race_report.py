@@ -120,7 +120,9 @@ def winner_table(result: dict[str, Any]) -> list[list[str]]:
 def _podium(ranking: list[dict[str, Any]]) -> str:
     if not ranking:
         return "nobody done"
-    texts = [f"{e['name']} {_MARKS[e['how']]}{_percent(e['error'])}" for e in ranking]
+    if ranking[0]["how"] == "far":
+        return "not measured that far"
+    texts = [f"{e['name']} {_MARKS[e['how']]}{_percent(e['error'])}" for e in ranking if e["how"] != "far"]
     return texts[0] + (f", then {texts[1]}" if len(texts) > 1 else "")
 
 
@@ -153,8 +155,11 @@ def caption(result: dict[str, Any]) -> str:
         "too slow for all of them, times scaled.",
     ]
     if shares:
+        sessions = result.get("provenance", {}).get("sessions") or [{}]
+        most = max(session.get("workers") or 1 for session in sessions)
+        order = "Peers ran one after another. " if most == 1 else f"{most} peers at once disturbed each other. "
         lines.append(
-            f"The process had {100 * min(shares):.0f} to {100 * max(shares):.0f} % of its core; load average "
+            f"{order}The process had {100 * min(shares):.0f} to {100 * max(shares):.0f} % of its core; load average "
             f"{min(loads, default=0):.1f} to {max(loads, default=0):.1f}."
         )
     return "\n".join(lines)

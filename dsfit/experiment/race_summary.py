@@ -184,6 +184,7 @@ def _standings(all_: list[Entrant], group: str, counted: bool, budget: float) ->
         if any(reading.how == "never" for reading in readings):
             continue
         error = math.exp(statistics.fmean(math.log(reading.value) for reading in readings))
-        how = "extrapolated" if any(r.how == "extrapolated" for r in readings) else "measured"
+        hows = [r.how for r in readings]
+        how = next((h for h in ("far", "extrapolated") if h in hows), "measured")
         found.append({"name": entrant.name, "error": error, "how": how})
     return found

@@ -18,6 +18,8 @@ from dsfit.random import child
 
 GROWTH = 4
 _AT_REPEATS = 5
+_SHARE = 0.25
+"""Share of the seconds left that estimates of one length may take beyond the fewest."""
 _CHUNK = 2**14
 
 
@@ -75,15 +77,20 @@ def race_context(
             predicted = predicted_variance(sampler, nodes, truth, context.dtype)
         points: list[dict[str, Any]] = []
         spent, samples = 0.0, sampler.least if sampler.least > 1 else GROWTH
-        _, expected = timed(lambda: sampler.estimate(samples, child(generator)))
-        while True:
-            count = int(max(plan.fewest, min(plan.seeds, 0.5 * (plan.seconds - spent) / max(expected, 1e-9))))
-            if points and (count * expected > plan.seconds - spent or samples > plan.most_samples):
+        while samples <= plan.most_samples or not points:
+            # a call has a price of its own, so the time of a longer one is measured and not inferred
+            _, expected = timed(lambda samples=samples: sampler.estimate(samples, child(generator)))
+            spent += expected
+            left = plan.seconds - spent
+            count = int(max(plan.fewest, min(plan.seeds, _SHARE * left / max(expected, 1e-9))))
+            if points and count * expected > left:
                 break
             point = _point(sampler, samples, count, truth, generator, allowance, predicted)
             points.append(point)
             spent += point.pop("spent")
-            expected, samples = GROWTH * point["seconds"][1], GROWTH * samples
+            samples *= GROWTH
+            if GROWTH * point["seconds"][1] > plan.seconds - spent:
+                break
     return {"at_seconds": at, "points": points, "predicted_variance": predicted}
 
 

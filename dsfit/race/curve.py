@@ -8,11 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+_FAR = 100.0
+
 
 @dataclass(frozen=True)
 class Reading:
     """A number read off a curve. `how`: "measured" (between measured points), "extrapolated" (beyond the last one, by
-    t^-1/2), "at most" (the first point is better already), or "never" (infinite or not there)."""
+    t^-1/2), "far" (the same, for more than 100 times as long), "at most" (the first point is better already), or
+    "never" (infinite or not there)."""
 
     value: float
     how: str
@@ -57,5 +60,6 @@ class Curve:
         time, reached = self._logs()
         at = math.log(left)
         if at > time[-1]:
-            return Reading(math.exp(reached[-1] - (at - time[-1]) / 2), "extrapolated")
+            how = "far" if at - time[-1] > math.log(_FAR) else "extrapolated"
+            return Reading(math.exp(reached[-1] - (at - time[-1]) / 2), how)
         return Reading(math.exp(float(np.interp(at, time, reached))), "measured")

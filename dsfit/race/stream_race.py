@@ -70,7 +70,7 @@ def race_stream(
                 passes.append(_pass(ready, parts, samplers, samples, generator))
             ats += [one.at for one in passes]
             points.append(_point(passes, samples, truth, scale, allowance))
-            expected = GROWTH * points[-1]["seconds"] / scale
+            expected = _next(points) / scale
             samples *= GROWTH
             if expected > plan.seconds or samples > plan.most_samples:
                 break
@@ -78,6 +78,15 @@ def race_stream(
     seconds = scale * (statistics.median(ats) if at is None else at)
     facts = {"contexts": len(contexts), "subset": count, "at_seconds": seconds, "points": points}
     return facts, torch.sqrt(squared)
+
+
+def _next(points: list[dict[str, Any]]) -> float:
+    """Seconds that a pass with more samples will take: a price per call and one per sample, as far as known."""
+    last = points[-1]
+    if len(points) == 1:
+        return GROWTH * last["seconds"]
+    slope = (last["seconds"] - points[-2]["seconds"]) / (last["samples"] - points[-2]["samples"])
+    return last["seconds"] + max(slope, 0.0) * (GROWTH - 1) * last["samples"]
 
 
 def _batches(contexts: Context, size: int) -> list[Context]:

@@ -16,7 +16,8 @@ LAW = Curve(0.0, SECONDS, [0.02 / math.sqrt(t) for t in SECONDS])
 def test_a_power_law_is_read_exactly_inside_and_beyond(error: float, how: str) -> None:
     assert LAW.time_to(error).value == pytest.approx((0.02 / error) ** 2) and LAW.time_to(error).how == how
     back = LAW.error_at((0.02 / error) ** 2)
-    assert back.value == pytest.approx(error) and back.how == how
+    far = (0.02 / error) ** 2 > 100 * SECONDS[-1]
+    assert back.value == pytest.approx(error) and back.how == ("far" if far else how)
 
 
 def test_before_the_first_point_there_is_no_error_and_an_upper_bound_of_the_time() -> None:
