@@ -28,8 +28,8 @@ SOME = dsfit.Context(
 @pytest.mark.parametrize("preset", ["blond", "black"])
 def test_objective_is_the_excess(preset: str) -> None:
     """The grids' sum of squares against adaptive cubature, untrained. The azimuthal laws are linear between the nodes
-    of their tables, and tensor rules see those kinks to a few per mille of the excess; the sparser nodes of the training to a few
-    per cent."""
+    of their tables, and tensor rules see those kinks to a few per mille of the excess; the
+    sparser nodes of the training to a few per cent."""
     proposal = untrained(preset)
     targets = make_targets(bsdf(preset), proposal, SOME)
     fine = make_targets(bsdf(preset), proposal, SOME, dtype=torch.float64, theta_nodes=6, azimuth_nodes=10)
@@ -94,6 +94,13 @@ def test_equal_seeds_give_equal_results() -> None:
     first, again, other = (amortise(bsdf(), seed=seed, **options) for seed in (5, 5, 6))
     assert first.excess == again.excess and first.excess != other.excess
     for p, q in zip(first.proposal.parameters(), again.proposal.parameters(), strict=True):
+        torch.testing.assert_close(p, q, rtol=0, atol=0)
+
+
+def test_no_steps_leave_the_proposal_as_it_is() -> None:
+    found = amortise(bsdf(), start=changed(0.2), steps=0, inclinations=3, pairs=2)
+    assert found.steps == 0 and not found.history
+    for p, q in zip(found.proposal.parameters(), changed(0.2).parameters(), strict=True):
         torch.testing.assert_close(p, q, rtol=0, atol=0)
 
 

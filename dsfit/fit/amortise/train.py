@@ -19,7 +19,7 @@ from dsfit.streams import ContextStream
 
 TRAINING = ContextStream(theta="angle", theta_max=math.radians(89.8), rule="mixed", direct=0.2, n_mean=15.0)
 """Uniform in theta_r and nearly so in n to 30, v of every kind: what a renderer may meet, and a little beyond."""
-STEPS = 1000
+STEPS = 400
 _RATE, _LAST_RATE, _WARM = 1e-2, 1e-5, 30
 _BATCH = 24
 
@@ -79,7 +79,7 @@ def amortise(
         bsdf: of one round fibre. `precision="table"` makes the targets tens of times faster.
         stream: of the training contexts. The default is uniform in theta_r, with v of every kind.
         seconds: wall time of the training proper, without targets; then the result depends on the machine.
-        steps: number of steps, if `seconds` is not given; 1000 if neither is. Equal seeds and steps give equal
+        steps: number of steps, if `seconds` is not given; 400 if neither is. Equal seeds and steps give equal
             results on one machine.
         seed: of the contexts, the order of the batches, and the network's first weights.
         hidden, defensive: see `AmortisedProposal`.
@@ -94,7 +94,7 @@ def amortise(
     _check(bsdf, stream, start, inclinations=(inclinations, 1), pairs=(pairs, 1), seed=(seed, 0))
     if seconds is not None and steps is not None:
         raise InputError("seconds, steps", (seconds, steps), "one of them")
-    limit = math.inf if seconds is None else as_number("seconds", seconds, 0.0)
+    limit = math.inf if seconds is None else as_number("seconds", seconds, 0.0, open_low=True)
     steps = STEPS if steps is None and seconds is None else steps
     if steps is not None:
         _check_count("steps", steps, 0)
@@ -161,7 +161,7 @@ def _train(
     order = torch.randperm(len(targets), generator=generator)
     while True:
         spent = time.perf_counter() - began
-        share = spent / limit if steps is None else done / max(steps, 1)
+        share = spent / limit if steps is None else done / steps if steps else 1.0
         if share >= 1:
             break
         rate = _LAST_RATE + _RATE * 0.5 * (1 + math.cos(math.pi * share)) * min(1.0, (done + 1) / _WARM)
