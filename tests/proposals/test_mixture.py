@@ -15,6 +15,8 @@ from dsfit.errors import InputError
 from dsfit.proposals import BackHalf, FrontHemisphere, Lobe, Mixture, Product, UniformInclination, UniformSphere
 from dsfit.proposals.base import Distribution, Proposal
 from dsfit.proposals.mixture import log_sum_exp
+from dsfit.proposals.split_lobe import SplitGaussianLobe
+from dsfit.proposals.uniform import UniformAzimuth
 from tests.proposals.cases import ALPHA, BETA, BETA_F, GAMMA
 
 
@@ -162,3 +164,31 @@ def test_input_errors() -> None:
         Mixture(lobes(), [1.0, 2.0])
     with pytest.raises(InputError, match="weights"):
         Mixture(lobes(), [1.0, 0.0, 2.0])
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_masses_taken_together_are_those_of_each_lobe(batch: tuple[int, ...]) -> None:
+    shapes = ((0.1, 0.2, 0.4), (-1.2, 0.01, 0.02), (0.7, 1.5, 0.1))  # the second mostly out of reach
+    mixture = Mixture([Product(SplitGaussianLobe(*shape), UniformAzimuth()) for shape in shapes])
+    context = Context(torch.linspace(-1.2, 1.4, math.prod(batch), dtype=torch.float64).reshape(batch))
+    found = mixture(context)
+    omega = found.sample(uniforms(50, *batch, found.dimension))
+    alone = torch.stack(torch.broadcast_tensors(*(c.log_prob(omega) for c in found.components)), dim=-1)
+    together = found.component_log_probs(omega)
+    torch.testing.assert_close(together, alone, rtol=1e-13, atol=1e-13)
+    leaf = mixture.components[1].longitudinal.mode
+    slopes = [torch.autograd.grad(x[..., 1].sum(), list(leaf.parameters()), retain_graph=True)[0] for x in (together, alone)]
+    torch.testing.assert_close(*slopes, rtol=1e-10, atol=1e-10)
+
+
+def test_a_mixture_still_rejects_directions_that_are_not_finite() -> None:
+    found = Mixture(lobes())(Context(0.2))
+    with pytest.raises(InputError, match="finite"):
+        found.log_prob(torch.tensor([[0.1, 0.2], [math.nan, 0.0]], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("value", [-math.inf, math.inf, math.nan])
+def test_contexts_reject_numbers_that_are_not_finite(value: float) -> None:
+    for field in ("theta_r", "phi_r", "n", "v"):
+        with pytest.raises(InputError, match=f"context.{field}"):
+            Context(**{"theta_r": 0.2, field: torch.tensor([0.1, value], dtype=torch.float64)})
