@@ -16,7 +16,7 @@ _EPS = 2.0**-25
 
 
 def draw(
-    layout: Layout, fields: Tensor, theta_r: Tensor, laws: tuple[Tensor, Tensor], u: tuple[Tensor, Tensor, Tensor]
+    layout: Layout, fields: Tensor, theta_r: Tensor, laws: tuple[Tensor, ...], u: tuple[Tensor, Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
     """theta_i and phi `[S, B]`.
 
@@ -73,10 +73,10 @@ def _inclination(chosen: dict[str, Tensor], u: Tensor) -> Tensor:
 
 
 def _azimuth(
-    layout: Layout, laws: tuple[Tensor, Tensor], number: Tensor, diff: Tensor, rest: Tensor, target: Tensor
+    layout: Layout, laws: tuple[Tensor, ...], number: Tensor, diff: Tensor, rest: Tensor, target: Tensor
 ) -> Tensor:
     """|phi| from one row of a table: bisection for the column, then the root of its linear density."""
-    density, cumulative = laws
+    density, cumulative = laws[:2]
     rows, columns = layout.law_rows, layout.law_columns
     x = (diff * ((rows - 1) / HALF_PI)).clamp_max(rows - 1)
     row = x.to(torch.int32).clamp_max(rows - 2)

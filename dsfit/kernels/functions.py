@@ -23,13 +23,13 @@ class Tables:
         constants: of the fibre, in the order of `evaluate.Constants`.
         records: `[rows * columns, width]`.
         averages: `[knots, 5 C]`.
-        laws: density and CDF of |phi|, each flat `[tables * law_rows * law_columns]`.
+        laws: density and CDF of |phi|, each flat `[tables * law_rows * law_columns]`, and the guides to their columns.
     """
 
     constants: Tensor
     records: Tensor
     averages: Tensor
-    laws: tuple[Tensor, Tensor]
+    laws: tuple[Tensor, Tensor, Tensor]
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,8 @@ from dsfit.kernels.tables import Grid, average_table, azimuth_columns, check_ser
 from dsfit.proposals.amortised import AmortisedProposal
 from dsfit.scene.lights import Light
 
-_FINER = (2, 2)
+_FINER = (2, 1)
+"""Cells of the records in one cell of the proposal's azimuth tables, in theta_diff and in phi."""
 
 
 class HairKernel:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 NEEDS = ("both", "direct", "scattered")
 BLOCK = 16
 """Directions that are computed at once: functions get at least as many."""
+GUIDE = 128
+"""Equal steps of the CDF in the guides that bracket a column; a power of 2, so that steps are told exactly."""
 LOBES = ("R", "TT", "TRT")
 FIELDS = ("mode", "below", "above", "log_scale", "edge", "left", "far_left", "near_left", "far_right", "near_right")
 """Per component of the mixture, each `[K, B]`.
@@ -66,6 +68,7 @@ class Layout:
 
     @property
     def width(self) -> int:
-        """Numbers per record, filled up to whole cache lines."""
+        """Numbers per record, filled up to half a cache line or whole ones."""
         sizes = [1 if name == "R_scattered" else self.channels for name in self.tabulated()]
-        return max(1, -(-(self.tables + sum(sizes)) // 16)) * 16
+        used = self.tables + sum(sizes)
+        return 8 if used <= 8 else -(-used // 16) * 16

@@ -27,6 +27,8 @@ INLINE I imin(I a, I b) { return a < b ? a : b; }
 #if defined(__AVX512F__)
 INLINE V root(V x) { return (V)_mm512_sqrt_ps((__m512)x); }
 INLINE V take(const float* p, I i) { return (V)_mm512_i32gather_ps((__m512i)i, p, 4); }
+INLINE I take_pairs(const uint16_t* p, I i) { return (I)_mm512_i32gather_epi32((__m512i)i, p, 2); }
+INLINE bool any(I x) { return _mm512_test_epi32_mask((__m512i)x, (__m512i)x) != 0; }
 INLINE V inverse_root(V x) {
     V y = (V)_mm512_rsqrt14_ps((__m512)x);
     return y * (1.5f - 0.5f * x * y * y);
@@ -38,6 +40,16 @@ INLINE V inverse(V x) {
 #else
 INLINE V root(V x) { V r; for (int l = 0; l < W; l++) r[l] = __builtin_sqrtf(x[l]); return r; }
 INLINE V take(const float* p, I i) { V r; for (int l = 0; l < W; l++) r[l] = p[i[l]]; return r; }
+INLINE I take_pairs(const uint16_t* p, I i) {
+    I r;
+    for (int l = 0; l < W; l++) r[l] = p[i[l]] | (int32_t)p[i[l] + 1] << 16;
+    return r;
+}
+INLINE bool any(I x) {
+    int32_t total = 0;
+    for (int l = 0; l < W; l++) total |= x[l];
+    return total;
+}
 INLINE V inverse_root(V x) { return 1.0f / root(x); }
 INLINE V inverse(V x) { return 1.0f / x; }
 #endif
@@ -122,13 +134,9 @@ INLINE V upper_quantile(V y) {
     V t = (root(vmax(w, all(6.25f))) - 4.1f) * 0.625f;
     static const float c[8] = {5.573054694f, 2.28473466f, 0.003671877968f, -0.004273630661f,
                                0.00237360244f, -0.001169801392f, 0.0004535794612f, -7.316103615e-05f};
-    V ahead{}, last = all(c[7]);
-    for (int k = 6; k > 0; k--) {
-        V next = 2.0f * t * last - ahead + c[k];
-        ahead = last;
-        last = next;
-    }
-    return w < 6.25f ? p * (1.0f - y) : t * last - ahead + c[0];
+    V q = all(c[7]);
+    for (int k = 6; k >= 0; k--) q = q * t + c[k];
+    return w < 6.25f ? p * (1.0f - y) : q;
 }
 
 template <int S> INLINE void swap_blocks(V* r) {
@@ -150,8 +158,18 @@ INLINE void transpose(V* r) {
     swap_blocks<1>(r);
 }
 
+// Every third number of 48, from the k-th on
+INLINE V third(const V* x, int k) {
+    I lane = {0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 33, 36, 39, 42, 45};
+    I wanted = lane + k;
+    V front = __builtin_shuffle(x[0], x[1], wanted & 31);
+    V back = __builtin_shuffle(x[2], x[2], wanted & 15);
+    return wanted < 2 * W ? front : back;
+}
+
 struct Tables {
     const float *constants, *records, *averages, *density, *cumulative;
+    const uint16_t* guide;
 };
 
 struct Context {
@@ -183,23 +201,51 @@ INLINE Direction at(V theta_i, V phi, V theta_r) {
     return d;
 }
 
-// Records of the sixteen directions, one quantity per row
-INLINE void look_up(const Tables& t, const Direction& d, V* rows) {
+struct Cell {
+    I first;
+    V across, along;
+};
+
+// The cell of the records; their lines are asked for at once
+INLINE Cell locate(const Tables& t, const Direction& d) {
     V x = vmin(d.diff * ((ROWS - 1) / 1.57079633f), all(ROWS - 1));
     V y = vmin(d.phi * ((COLUMNS - 1) / 3.14159265f), all(COLUMNS - 1));
     I i = imin(whole(x), I{} + (ROWS - 2)), j = imin(whole(y), I{} + (COLUMNS - 2));
-    V across = x - number(i), along = y - number(j);
-    I first = i * COLUMNS + j;
+    Cell cell = {i * COLUMNS + j, x - number(i), y - number(j)};
+    for (int l = 0; l < W; l++) {
+        const float* p = t.records + (int64_t)cell.first[l] * WIDTH;
+        for (int k = 0; k < 2 * WIDTH; k += W) {
+            __builtin_prefetch(p + k);
+            __builtin_prefetch(p + COLUMNS * WIDTH + k);
+        }
+    }
+    return cell;
+}
+
+// Records of the sixteen directions, one quantity per row
+INLINE void look_up(const Tables& t, const Cell& cell, V* rows) {
+#if WIDTH == 8
+    // one load holds two neighbours along phi
+    V both[W];
+    for (int l = 0; l < W; l++) {
+        const float* p = t.records + (int64_t)cell.first[l] * WIDTH;
+        V low = load(p), high = load(p + COLUMNS * WIDTH);
+        both[l] = low + (high - low) * cell.across[l];
+    }
+    transpose(both);
+    for (int k = 0; k < WIDTH; k++) rows[k] = both[k] + (both[k + WIDTH] - both[k]) * cell.along;
+#else
     for (int part = 0; part < WIDTH / W; part++) {
         for (int l = 0; l < W; l++) {
-            const float* p = t.records + (int64_t)first[l] * WIDTH + part * W;
+            const float* p = t.records + (int64_t)cell.first[l] * WIDTH + part * W;
             V low = load(p), next_low = load(p + WIDTH);
             V high = load(p + COLUMNS * WIDTH), next_high = load(p + (COLUMNS + 1) * WIDTH);
-            V below = low + (next_low - low) * along[l], above = high + (next_high - high) * along[l];
-            rows[part * W + l] = below + (above - below) * across[l];
+            V below = low + (next_low - low) * cell.along[l], above = high + (next_high - high) * cell.along[l];
+            rows[part * W + l] = below + (above - below) * cell.across[l];
         }
         transpose(rows + part * W);
     }
+#endif
 }
 
 INLINE void look_up_averages(const Tables& t, V theta_i, V* rows) {
@@ -312,12 +358,16 @@ INLINE V azimuth(const Tables& t, I law, V diff, V rest, V target) {
     V x = vmin(diff * ((LAW_ROWS - 1) / 1.57079633f), all(LAW_ROWS - 1));
     I row = imin(whole(x), I{} + (LAW_ROWS - 2));
     row = rest < x - number(row) ? row + 1 : row;
-    I first = (law * LAW_ROWS + row) * LAW_COLUMNS, low{};
-    int step = 1;
-    while (step < LAW_COLUMNS - 1) step *= 2;
-    while (step /= 2) {
-        I middle = imin(low + step, I{} + (LAW_COLUMNS - 2));
-        low = take(t.cumulative, first + middle) <= target ? middle : low;
+    I number_of_row = law * LAW_ROWS + row;
+    I first = number_of_row * LAW_COLUMNS;
+    // the guide brackets the column; what is left is bisected
+    I pair = take_pairs(t.guide, number_of_row * (GUIDE + 1) + imin(whole(target * GUIDE), I{} + (GUIDE - 1)));
+    I low = pair & 0xffff, high = ((pair >> 16) & 0xffff) + 1;
+    while (any(high - low > 1)) {
+        I middle = (low + high) >> 1;
+        I below = take(t.cumulative, first + middle) <= target;
+        low = below ? middle : low;
+        high = below ? high : middle;
     }
     const float width = 3.14159265f / (LAW_COLUMNS - 1);
     I here = first + low;
@@ -330,9 +380,8 @@ INLINE V azimuth(const Tables& t, I law, V diff, V rest, V target) {
 
 template <bool SINGLE>
 INLINE void draw(const Tables& t, const Context& c, int64_t b, const float* u, V* theta_i, V* phi) {
-    V us[3];
-    for (int l = 0; l < W; l++)
-        for (int k = 0; k < 3; k++) us[k][l] = u[3 * l + k];
+    V us[3], triples[3] = {load(u), load(u + W), load(u + 2 * W)};
+    for (int k = 0; k < 3; k++) us[k] = third(triples, k);
     const float eps = 2.98023224e-8f;
     for (int k = 0; k < 3; k++) us[k] = vmin(vmax(us[k], all(eps)), all(1.0f - 5.96046448e-8f));
     static const int wanted[8] = {MODE, BELOW, ABOVE, LEFT, FAR_LEFT, NEAR_LEFT, FAR_RIGHT, NEAR_RIGHT};
@@ -368,62 +417,93 @@ INLINE void draw(const Tables& t, const Context& c, int64_t b, const float* u, V
     *phi = signed_like(outside ? even : drawn, sign);
 }
 
-// Calls `body(context index, direction index)` for blocks of sixteen; the last block of a row overlaps the one before.
-template <typename F> INLINE void blocks(int64_t samples, int64_t batch, F body) {
-    for (int64_t s = 0; s < samples; s++)
-        for (int64_t b = 0; b < batch; b += W) {
-            int64_t start = b + W > batch ? batch - W : b;
-            body(start, s * batch + start);
+#define GROUP 4
+
+struct Place {
+    int64_t context, direction;
+    Direction at;
+    Cell cell;
+};
+
+// Calls `begin(place)` and later `finish(place)` for blocks of sixteen, all samples of a block of contexts in turn; the
+// last block overlaps the one before. A group of blocks begins before the first of them is finished, so that records
+// are on their way while others are computed.
+template <typename A, typename B> INLINE void blocks(int64_t samples, int64_t batch, A begin, B finish) {
+    Place places[GROUP];
+    int waiting = 0;
+    for (int64_t b = 0; b < batch; b += W) {
+        int64_t start = b + W > batch ? batch - W : b;
+        for (int64_t s = 0; s < samples; s++) {
+            Place& place = places[waiting++];
+            place.context = start;
+            place.direction = s * batch + start;
+            begin(place);
+            if (waiting < GROUP) continue;
+            for (int k = 0; k < GROUP; k++) finish(places[k]);
+            waiting = 0;
         }
+    }
+    for (int k = 0; k < waiting; k++) finish(places[k]);
 }
 
 template <bool SINGLE>
 static void run_eval(const Tables& t, const Context& c, int64_t s, int64_t b, const float* theta, const float* phi,
                      float* out) {
-    blocks(s, b, [&](int64_t k, int64_t i) {
-        Direction d = at(load(theta + i), load(phi + i), of<SINGLE>(c.theta_r, k));
+    auto begin = [&](Place& p) {
+        p.at = at(load(theta + p.direction), load(phi + p.direction), of<SINGLE>(c.theta_r, p.context));
+        if (TABULATED) p.cell = locate(t, p.at);
+    };
+    blocks(s, b, begin, [&](const Place& p) {
         V record[WIDTH], value[CHANNELS];
-        if (TABULATED) look_up(t, d, record);
-        evaluate(t, d, record, of<SINGLE>(c.n, k), of<SINGLE>(c.v, k), value);
-        for (int q = 0; q < CHANNELS; q++) store(out + q * s * b + i, value[q]);
+        if (TABULATED) look_up(t, p.cell, record);
+        evaluate(t, p.at, record, of<SINGLE>(c.n, p.context), of<SINGLE>(c.v, p.context), value);
+        for (int q = 0; q < CHANNELS; q++) store(out + q * s * b + p.direction, value[q]);
     });
 }
 
 template <bool SINGLE>
 static void run_log_prob(const Tables& t, const Context& c, int64_t s, int64_t b, const float* theta, const float* phi,
                          float* out) {
-    blocks(s, b, [&](int64_t k, int64_t i) {
-        Direction d = at(load(theta + i), load(phi + i), of<SINGLE>(c.theta_r, k));
+    auto begin = [&](Place& p) {
+        p.at = at(load(theta + p.direction), load(phi + p.direction), of<SINGLE>(c.theta_r, p.context));
+        if (LAW_TABLES) p.cell = locate(t, p.at);
+    };
+    blocks(s, b, begin, [&](const Place& p) {
         V record[WIDTH];
-        if (LAW_TABLES) look_up(t, d, record);
-        store(out + i, logarithm(vmax(density<SINGLE>(c, k, d, record), all(1.17549435e-38f))));
+        if (LAW_TABLES) look_up(t, p.cell, record);
+        V value = density<SINGLE>(c, p.context, p.at, record);
+        store(out + p.direction, logarithm(vmax(value, all(1.17549435e-38f))));
     });
 }
 
 template <bool SINGLE>
 static void run_sample(const Tables& t, const Context& c, int64_t s, int64_t b, const float* u, float* theta,
                        float* phi) {
-    blocks(s, b, [&](int64_t k, int64_t i) {
+    blocks(s, b, [](Place&) {}, [&](const Place& p) {
         V x, y;
-        draw<SINGLE>(t, c, k, u + 3 * i, &x, &y);
-        store(theta + i, x);
-        store(phi + i, y);
+        draw<SINGLE>(t, c, p.context, u + 3 * p.direction, &x, &y);
+        store(theta + p.direction, x);
+        store(phi + p.direction, y);
     });
 }
 
 template <bool SINGLE>
 static void run_sample_eval(const Tables& t, const Context& c, int64_t s, int64_t b, const float* u, float* theta,
                             float* phi, float* pdf, float* out) {
-    blocks(s, b, [&](int64_t k, int64_t i) {
-        V x, y, record[WIDTH], value[CHANNELS];
-        draw<SINGLE>(t, c, k, u + 3 * i, &x, &y);
-        Direction d = at(x, y, of<SINGLE>(c.theta_r, k));
-        look_up(t, d, record);
-        evaluate(t, d, record, of<SINGLE>(c.n, k), of<SINGLE>(c.v, k), value);
-        store(theta + i, x);
-        store(phi + i, y);
-        store(pdf + i, density<SINGLE>(c, k, d, record));
-        for (int q = 0; q < CHANNELS; q++) store(out + q * s * b + i, value[q]);
+    auto begin = [&](Place& p) {
+        V x, y;
+        draw<SINGLE>(t, c, p.context, u + 3 * p.direction, &x, &y);
+        store(theta + p.direction, x);
+        store(phi + p.direction, y);
+        p.at = at(x, y, of<SINGLE>(c.theta_r, p.context));
+        p.cell = locate(t, p.at);
+    };
+    blocks(s, b, begin, [&](const Place& p) {
+        V record[WIDTH], value[CHANNELS];
+        look_up(t, p.cell, record);
+        store(pdf + p.direction, density<SINGLE>(c, p.context, p.at, record));
+        evaluate(t, p.at, record, of<SINGLE>(c.n, p.context), of<SINGLE>(c.v, p.context), value);
+        for (int q = 0; q < CHANNELS; q++) store(out + q * s * b + p.direction, value[q]);
     });
 }
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dsfit.kernels.functions import Functions
-from dsfit.kernels.layout import LOBES, Layout
+from dsfit.kernels.layout import GUIDE, LOBES, Layout
 
 _FLAGS = ("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast",
           "-Wno-psabi", "-shared", "-fPIC")  # fmt: skip
@@ -27,8 +27,11 @@ class NoCompiler(RuntimeError):
     """No C++ compiler that can build the kernel."""
 
 
+_TABLES = ("constants", "records", "averages", "density", "cumulative", "guide")
+
+
 class _Tables(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_void_p) for name in ("constants", "records", "averages", "density", "cumulative")]
+    _fields_ = [(name, ctypes.c_void_p) for name in _TABLES]
 
 
 class _Context(ctypes.Structure):
@@ -52,6 +55,7 @@ def header(layout: Layout) -> str:
         "LAW_TABLES": layout.tables,
         "LAW_ROWS": layout.law_rows,
         "LAW_COLUMNS": layout.law_columns,
+        "GUIDE": GUIDE,
         "HALF_BACK": int(layout.half_back),
         "S_ANY": int(bool(layout.scattered)),
     }
@@ -138,13 +142,13 @@ def native_functions(layout: Layout) -> Functions:
     def evaluated(constants, records, averages, context, theta_i, phi):  # noqa: ANN001, ANN202
         out = theta_i.new_empty(layout.channels, *theta_i.shape)
         c = (*tables(*context, None), len(context[0]), 0.0)
-        call("dsfit_eval", tables(constants, records, averages, None, None), c, theta_i.shape, theta_i, phi, out)
+        call("dsfit_eval", tables(constants, records, averages, None, None, None), c, theta_i.shape, theta_i, phi, out)
         return out
 
     def log_prob(records, theta_r, mixture, theta_i, phi):  # noqa: ANN001, ANN202
         out = torch.empty_like(theta_i)
         c = (*tables(theta_r, None, None, mixture[0]), len(theta_r), float(mixture[1]))
-        call("dsfit_log_prob", tables(None, records, None, None, None), c, theta_i.shape, theta_i, phi, out)
+        call("dsfit_log_prob", tables(None, records, None, None, None, None), c, theta_i.shape, theta_i, phi, out)
         return out
 
     def sample(theta_r, fields, laws, u):  # noqa: ANN001, ANN202

@@ -10,7 +10,7 @@ _BODY = (
     1.253314044, 0.3281200195, 0.01631625781, -0.003268174582, -0.0002139362175, 8.208768495e-05, -6.607918076e-07,
     -1.591124583e-06, 1.88914308e-07, -7.155819616e-09,
 )  # fmt: skip
-# x in Chebyshev polynomials of (sqrt w - 4.1) / 1.6, |relative error| < 9e-8 for sqrt w in [2.5, 5.7]
+# x in powers of (sqrt w - 4.1) / 1.6, |relative error| < 9e-8 for sqrt w in [2.5, 5.7]
 _TAIL = (
     5.573054694, 2.28473466, 0.003671877968, -0.004273630661, 0.00237360244, -0.001169801392, 0.0004535794612,
     -7.316103615e-05,
@@ -29,8 +29,7 @@ def upper_quantile(y: Tensor) -> Tensor:
     for value in _BODY[-2::-1]:
         body = body * w + value
     t = (torch.sqrt(w.clamp_min(_SPLIT)) - 4.1) * (1 / 1.6)
-    ahead, last = torch.zeros_like(t), torch.full_like(t, _TAIL[-1])
-    for value in _TAIL[-2:0:-1]:
-        ahead, last = last, 2 * t * last - ahead + value
-    tail = t * last - ahead + _TAIL[0]
+    tail = torch.full_like(t, _TAIL[-1])
+    for value in _TAIL[-2::-1]:
+        tail = tail * t + value
     return torch.where(w < _SPLIT, body * (1 - y), tail)

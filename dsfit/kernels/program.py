@@ -12,7 +12,7 @@ from dsfit.errors import InputError
 from dsfit.kernels.contexts import Contexts
 from dsfit.kernels.functions import Functions, Tables
 from dsfit.kernels.layout import BLOCK, Layout
-from dsfit.kernels.tables import refined
+from dsfit.kernels.tables import guides, refined
 from dsfit.proposals.conditional import FiberAzimuth
 from dsfit.proposals.lobe_moments import DIRECT, SCATTERED
 from dsfit.proposals.uniform import BackHalf
@@ -126,12 +126,12 @@ def build_program(kernel: HairKernel, need: str) -> Program:
         law_columns=kernel.laws.grid.columns,
         knots=len(kernel.averages),
     )
-    density = kernel.laws.density[tables]
+    density, cumulative = kernel.laws.density[tables], kernel.laws.cumulative[tables].float()
     tensors = Tables(
         constants=_constants(kernel),
         records=_records(kernel, layout, density),
         averages=_averages(kernel),
-        laws=tuple(x.to(torch.float32).flatten().contiguous() for x in (density, kernel.laws.cumulative[tables])),
+        laws=(density.float().flatten(), cumulative.flatten(), guides(cumulative).flatten()),
     )
     return Program(layout, tensors, components, kernel.functions(layout))
 

@@ -12,6 +12,7 @@ from dsfit.bsdf.averages import Averages
 from dsfit.bsdf.dual_scattering import DualScattering
 from dsfit.errors import InputError
 from dsfit.frame import HALF_PI
+from dsfit.kernels.layout import GUIDE
 from dsfit.proposals.amortised import AmortisedProposal
 from dsfit.proposals.conditional import FiberAzimuth
 
@@ -125,6 +126,13 @@ def law_tables(proposal: AmortisedProposal) -> LawTables:
     density = torch.stack([law.density.to(torch.float64) for law in laws])
     cumulative = torch.stack([law.cumulative.to(torch.float64) for law in laws])
     return LawTables(Grid(density.shape[1], density.shape[2]), density, cumulative, number)
+
+
+def guides(cumulative: Tensor) -> Tensor:
+    """`[..., GUIDE + 1]`, 16-bit: the last column whose CDF `[..., columns]` does not exceed k / GUIDE."""
+    steps = (torch.arange(GUIDE + 1) / GUIDE).to(cumulative.dtype).expand(*cumulative.shape[:-1], -1).contiguous()
+    last = cumulative.shape[-1] - 2
+    return (torch.searchsorted(cumulative.contiguous(), steps, right=True) - 1).clamp(0, last).to(torch.int16)
 
 
 def refined(values: Tensor, rows: int, columns: int) -> Tensor:
