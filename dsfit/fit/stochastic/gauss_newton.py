@@ -137,9 +137,7 @@ class GaussNewtonRun:
         problem = self._problem(drawn)
         limits = {"max_steps": self.options.inner, "tolerance": 1e-4, "reach": REACH}
         self.fitted = minimise(problem, self.fitted, "optimistix.lm", **limits, **NATURAL).y
-        count = len(drawn.omega)
-        freedom = len(self.y0) / max(count - len(self.y0), 1)
-        self.sampling = self._noise(self.fitted, drawn) * freedom / (4 * self.context.batch_shape.numel())
+        self.sampling = self._sampling(drawn)
         gain = problem.problem.value(self.y0) - problem.problem.value(self.fitted)
         kept = max(1 - self.sampling / gain, 0.0) if gain > 0 else 0.0
         self.before, self.y = self.y, self.y0 + kept * (self.fitted - self.y0)
@@ -169,6 +167,18 @@ class GaussNewtonRun:
         ]
         pull = self._noise(self.y, drawn) * share / (4 * count * self.options.spread**2)
         return Anchored(ProposalProblem(self.setting.work, targets, Excess()), self.y0, pull)
+
+    def _sampling(self, drawn: Draws) -> float:
+        """O of the module's text. In place of N - P, what corrects k for having been fitted, the share of samples that
+        M rests on counts: of ten samples with light among a hundred, as many parameters leave nothing."""
+        size = len(self.y0)
+        log_m = drawn.log_square - self._log_p(self.y, drawn).clamp_min(LOG_FLOOR) - drawn.log_q
+        log_m = log_m[:, (log_m > -math.inf).any(0)]
+        weight = torch.softmax(log_m, 0)
+        effective = float((1 / weight.square().sum(0)).sum())
+        if effective <= size:
+            return math.inf
+        return self._noise(self.fitted, drawn) * size / (4 * log_m.numel()) * effective / (effective - size)
 
     def _log_moment(self, y: Tensor, drawn: Draws) -> Tensor:
         """log M `[B]` at parameters y; -inf where no sample has light."""
