@@ -35,6 +35,7 @@ _PUBLIC = {
     "estimate": "dsfit.mis",
     "excess": "dsfit.quality",
     "fit": "dsfit.fit",
+    "fit_stochastic": "dsfit.fit",
     "held_out": "dsfit.fit.amortise",
     "load_proposal": "dsfit.experiment",
     "plan": "dsfit.scene.plan",

@@ -16,6 +16,7 @@ from dsfit.fit.objectives import OBJECTIVES, Excess, ForwardKL, LogExcess, Objec
 from dsfit.fit.problem import FunctionProblem, Problem, compress
 from dsfit.fit.proposal_problem import ProposalProblem
 from dsfit.fit.solvers import SOLVERS, minimise
+from dsfit.fit.stochastic import StochasticFit, fit_stochastic
 from dsfit.fit.tracking import HistoryEntry, SolverResult
 from dsfit.fit.transmittance import TransmittanceFit, fit_transmittance
 
@@ -33,11 +34,13 @@ __all__ = [
     "Problem",
     "ProposalProblem",
     "SolverResult",
+    "StochasticFit",
     "Target",
     "TransmittanceFit",
     "VarianceCost",
     "compress",
     "fit",
+    "fit_stochastic",
     "fit_transmittance",
     "measure_costs",
     "minimise",
