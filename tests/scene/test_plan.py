@@ -52,7 +52,7 @@ def test_a_share_of_zero_is_exact(n: float, half: str) -> None:
 
 
 def test_no_back_scattering_is_exact() -> None:
-    integrand = dsfit.Integrand(BLOND.replace(d_b=0.0))
+    integrand = dsfit.Integrand(BLACK.replace(d_b=0.0))
     context = dsfit.Context(0.5, n=3.0, v=0.5)
     found = plan(integrand, context)
     assert dropped(found) == {("direct", "back"), ("scattered", "back")}

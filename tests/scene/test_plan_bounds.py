@@ -75,9 +75,9 @@ def violations(bounds: TermBounds, truth: Tensor) -> list[str]:
     return bad
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(4))
 def test_every_term_is_between_its_bounds(seed: int) -> None:
-    """Eight terms, two channels, below and above: 384 bounds; `test_many` has 3200."""
+    """Eight terms, two channels, below and above: 128 bounds; `test_many` has 3200."""
     g = torch.Generator().manual_seed(seed)
     bsdf, context = random_bsdf(g), random_context(g)
     assert violations(bounds_of(bsdf, context), direct_and_means(bsdf, context)) == []
@@ -151,9 +151,20 @@ def test_many(block: int) -> None:
         assert violations(bounds_of(bsdf, context), direct_and_means(bsdf, context)) == []
 
 
+@pytest.fixture(scope="module")
+def cases() -> list[tuple[dsfit.DualScattering, dsfit.Context, Tensor]]:
+    """Two random fibres in random contexts, with the integrals of their terms."""
+    g = torch.Generator().manual_seed(5)
+    found = [(random_bsdf(g), random_context(g)) for _ in range(2)]
+    return [(bsdf, context, direct_and_means(bsdf, context)) for bsdf, context in found]
+
+
 @pytest.mark.parametrize("wrong", ["a tenth", "no cos theta_i", "no widening", "absorption twice"])
-def test_a_wrong_bound_is_noticed(wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same comparison, with a slip planted into the bounds."""
+def test_a_wrong_bound_is_noticed(
+    wrong: str, cases: list[tuple[dsfit.DualScattering, dsfit.Context, Tensor]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same comparison, with a slip planted into the bounds; without one, nothing is noticed."""
+    assert not any(violations(bounds_of(bsdf, context), truth) for bsdf, context, truth in cases)
     original_cells, original_depth = terms_module._Cells.of, optics_module._depth
 
     def no_cosine(theta_r: Interval) -> object:
@@ -170,20 +181,16 @@ def test_a_wrong_bound_is_noticed(wrong: str, monkeypatch: pytest.MonkeyPatch) -
         monkeypatch.setattr(
             terms_module._Cells, "gauss", lambda self, c, s: original(self, c, Interval(s.low * 0.7, s.high * 0.7))
         )
-    g = torch.Generator().manual_seed(5)
-    caught = False
-    for _ in range(3):
-        bsdf, context = random_bsdf(g), random_context(g)
+    caught = []
+    for bsdf, context, truth in cases:
         bounds = bounds_of(bsdf, context)
         if wrong == "a tenth":
             bounds = TermBounds(bounds.upper / 10, bounds.peak, bounds.kept)
-        caught = bool(violations(bounds, direct_and_means(bsdf, context)))
-        if caught:
-            break
+        caught += violations(bounds, truth)
     assert caught
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_peaks_hold_in_every_direction_tried(seed: int) -> None:
     """The pointwise bound is proven; 4000 directions must not beat it, and come within a factor of it."""
     g = torch.Generator().manual_seed(seed)
@@ -220,7 +227,7 @@ def test_what_the_treatment_of_the_caustic_changes() -> None:
         assert bool(((a - b.value).abs() <= change).all())
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_range_holds_what_is_in_it(seed: int) -> None:
     """Bounds of boxes of theta_r and n enclose those of any context inside."""
     g = torch.Generator().manual_seed(seed)

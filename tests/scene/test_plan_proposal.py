@@ -57,9 +57,8 @@ def test_bad_input(start: dsfit.StructuredProposal) -> None:
 
 def test_numbers_where_there_are_no_names() -> None:
     """Any mixture: components are known by number, and one without a defensive share may lose its last."""
-    context = dsfit.Context(torch.zeros(2))
     mixture = dsfit.proposals.Mixture([UniformSphere(), UniformSphere()], [1.0, 1.0], defensive=0.0)
-    found = prune(mixture, BLACK, context)
+    found = prune(mixture, BLACK, CONTEXT)
     assert len(found.dropped) == 1 and found.gain == pytest.approx(4 / 3)
     torch.testing.assert_close(found.excess, found.excess_before)
     assert isinstance(found.proposal, PrunedProposal)
