@@ -150,7 +150,8 @@ def caption(result: dict[str, Any]) -> str:
         "prepare: once; context: work at each; sample: at the longest estimates; variance: relative, of one sample "
         "(quadrature's at single contexts where the density is known). Times of the stream count everything.",
         "× heuristic, × other: time to 1 % of the best of the chapter's heuristics, and of the best other peer, over "
-        "the peer's own (single contexts: prepared). ~: extrapolated by t^-1/2 from the last point; <: at most.",
+        "the peer's own (single contexts: prepared). ~: error extrapolated from the longest by S^-1/2; <: at "
+        "most.",
         "heavy tails: rare large weights decide, the error is understated and the peer does not win. on M contexts: "
         "too slow for all of them, times scaled.",
     ]

@@ -76,11 +76,16 @@ def entrants(cells: list[dict[str, Any]]) -> list[Entrant]:
 
 def curve(entrant: Entrant, row: dict[str, Any], *, counted: bool = True, which: str = "value") -> Curve:
     """Error against time of one stream or context; `counted` says whether preparation is; `which` of the root mean
-    square ("value") and the ends of its interval ("low", "high")."""
+    square ("value") and the ends of its interval ("low", "high"). Beyond the measured errors, where longer estimates
+    were timed, the error is taken to fall with the root of the samples."""
     points = row["points"]
     seconds = [number(p["seconds"][1] if isinstance(p["seconds"], list) else p["seconds"]) for p in points]
     before = number(row["at_seconds"]) + (entrant.prepare if counted else 0.0)
-    return Curve(before, seconds, [number(p["rmse"][which]) for p in points])
+    errors = [number(p["rmse"][which]) for p in points]
+    longer = row.get("scouts", [])
+    beyond = [errors[-1] * math.sqrt(points[-1]["samples"] / scout["samples"]) for scout in longer]
+    seconds += [number(scout["seconds"]) for scout in longer]
+    return Curve(before, seconds, [*errors, *beyond], len(points))
 
 
 def _time(entrant: Entrant, rows: list[dict[str, Any]], target: float, counted: bool) -> dict[str, Any]:
@@ -96,7 +101,7 @@ def _time(entrant: Entrant, rows: list[dict[str, Any]], target: float, counted: 
 
 
 def _facts(rows: list[dict[str, Any]], contexts: int) -> dict[str, float]:
-    last = [row["points"][-1] for row in rows]
+    last = [(row.get("scouts") or row["points"])[-1] for row in rows]
     seconds = [number(p["seconds"][1] if isinstance(p["seconds"], list) else p["seconds"]) for p in last]
     return {
         "at": statistics.median(number(row["at_seconds"]) for row in rows) / contexts,

@@ -68,7 +68,8 @@ def race_context(
     """Errors and times at one context of batch shape `[1]`; `truth` `[C]`.
 
     Every number of samples (growing by 4) gets up to `plan.seeds` independent estimates, each timed by itself; the
-    time of a point is their median. `at` is timed on its own, several times where it is quick.
+    time of a point is their median. `at` is timed on its own, several times where it is quick. `scouts` are times of
+    longer estimates, one each, for which there were not the seconds to measure an error.
     """
     with torch.no_grad():
         sampler, at = _at(ready, context, plan)
@@ -91,7 +92,21 @@ def race_context(
             samples *= GROWTH
             if GROWTH * point["seconds"][1] > plan.seconds - spent:
                 break
-    return {"at_seconds": at, "points": points, "predicted_variance": predicted}
+        scouts = _scouts(sampler, points[-1], plan, generator)
+    return {"at_seconds": at, "points": points, "scouts": scouts, "predicted_variance": predicted}
+
+
+def _scouts(
+    sampler: Sampler, last: dict[str, Any], plan: ContextPlan, generator: torch.Generator
+) -> list[dict[str, Any]]:
+    """Times of single longer estimates: where a call has a price of its own, the time does not grow with the samples as
+    it would be extrapolated."""
+    found, samples, seconds = [], last["samples"], last["seconds"][1]
+    while GROWTH * seconds <= plan.seconds and GROWTH * samples <= plan.most_samples:
+        samples *= GROWTH
+        _, seconds = timed(lambda samples=samples: sampler.estimate(samples, child(generator)))
+        found.append({"samples": samples, "seconds": seconds})
+    return found
 
 
 def _at(ready: Ready, context: Context, plan: ContextPlan) -> tuple[Sampler, float]:

@@ -29,11 +29,18 @@ class Curve:
         before: seconds spent before the first sample (preparation that is counted, work per context).
         seconds: of the estimates alone, increasing `[K]`.
         error: relative `[K]`; a later point that is worse counts as its best predecessor.
+        measured: how many of the points are; those after them have a measured time, and an error that was extrapolated.
+            Left out, all.
     """
 
     before: float
     seconds: Sequence[float]
     error: Sequence[float]
+    measured: int | None = None
+
+    def _how(self, time: np.ndarray, at: float) -> str:
+        last = len(time) if self.measured is None else self.measured
+        return "measured" if at <= time[last - 1] else "extrapolated"
 
     def _logs(self) -> tuple[np.ndarray, np.ndarray]:
         seconds = np.maximum.accumulate(np.maximum(np.asarray(self.seconds, dtype=float), 1e-12))
@@ -50,7 +57,8 @@ class Curve:
             return Reading(self.before + math.exp(time[0]), "at most")
         if reached[-1] > goal:
             return Reading(self.before + math.exp(min(time[-1] + 2 * (reached[-1] - goal), 700.0)), "extrapolated")
-        return Reading(self.before + math.exp(float(np.interp(-goal, -reached, time))), "measured")
+        at = float(np.interp(-goal, -reached, time))
+        return Reading(self.before + math.exp(at), self._how(time, at))
 
     def error_at(self, seconds: float) -> Reading:
         """The error reached within so many seconds; inf where not even the first point is done by then."""
@@ -62,4 +70,4 @@ class Curve:
         if at > time[-1]:
             how = "far" if at - time[-1] > math.log(_FAR) else "extrapolated"
             return Reading(math.exp(reached[-1] - (at - time[-1]) / 2), how)
-        return Reading(math.exp(float(np.interp(at, time, reached))), "measured")
+        return Reading(math.exp(float(np.interp(at, time, reached))), self._how(time, at))

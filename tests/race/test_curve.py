@@ -39,6 +39,14 @@ def test_a_point_that_is_worse_than_its_predecessor_counts_as_that() -> None:
     assert bumpy.time_to(0.1).value == pytest.approx(1.0)
 
 
+def test_points_of_which_only_the_time_was_measured_say_so() -> None:
+    # the third and fourth call cost no more than the second: 16 times the samples at 1.1 times its time
+    priced = Curve(0.0, [1.0, 1.1, 1.15, 1.2], [0.4, 0.2, 0.1, 0.05], 2)
+    assert priced.time_to(0.2).how == "measured" and priced.error_at(1.05).how == "measured"
+    assert priced.time_to(0.05) == Reading(pytest.approx(1.2), "extrapolated")
+    assert priced.error_at(1.15).how == "extrapolated" and priced.error_at(1.15).value == pytest.approx(0.1)
+
+
 def test_infinite_errors_and_no_points() -> None:
     assert Curve(0.0, [1.0], [math.inf]).time_to(0.01).how == "never"
     assert Curve(0.0, [], []).time_to(0.01).how == "never" and Curve(0.0, [], []).error_at(1.0).how == "never"

@@ -117,6 +117,30 @@ def test_at_one_context_the_measured_error_is_the_known_one_and_falls_as_the_roo
     assert last["samples"] == first["samples"] * 4 ** (len(found["points"]) - 1)
 
 
+def test_longer_estimates_are_timed_where_there_is_no_time_to_repeat_them() -> None:
+    class Slow(Noisy):
+        def at(self, contexts: Context) -> Sampler:
+            sampler = super().at(contexts)
+            quick = sampler.estimate
+
+            def estimate(samples: int, generator: torch.Generator) -> Tensor:
+                end = time.process_time() + 0.01
+                while time.process_time() < end:
+                    pass
+                return quick(samples, generator)
+
+            sampler.estimate = estimate  # type: ignore[method-assign]
+            return sampler
+
+    context = Context([0.3], 0.0, 1.0)
+    plan = ContextPlan(seconds=0.12, seeds=64, most_samples=4**8)
+    found = race_context(ready(Slow()), context, truth(context)[0], plan, generator(), allowance=0.0)
+    assert len(found["points"]) == 1 and len(found["points"][0]["rmse"]) > 3
+    samples = [scout["samples"] for scout in found["scouts"]]
+    assert samples == [4 ** (k + 2) for k in range(7)]
+    assert all(0.009 < scout["seconds"] for scout in found["scouts"])
+
+
 def test_quadrature_predicts_the_variance_of_a_density() -> None:
     x, w = gauss_legendre(40)
     theta = x * math.pi / 2

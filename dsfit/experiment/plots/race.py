@@ -109,12 +109,15 @@ def _lines(peers: list[Entrant], named: list[str], index: int | None, counted: b
         if entrant.biased:
             style["marker"] = "x"
         made = curve(entrant, row, counted=counted)
-        error = np.array([number(x) for x in made.error])
+        measured = slice(made.measured)
+        error = np.array([number(x) for x in made.error[measured]])
         keep = (error > 0) & (error <= HIGHEST)
         if not keep.any():
             continue
-        ends = [np.array(curve(entrant, row, which=which).error, dtype=float)[keep] for which in ("low", "high")]
-        seconds = np.array(made.seconds, dtype=float) + made.before
+        ends = [
+            np.array(curve(entrant, row, which=which).error[measured], dtype=float)[keep] for which in ("low", "high")
+        ]
+        seconds = np.array(made.seconds[measured], dtype=float) + made.before
         yield _Line(entrant.name if place >= 0 else None, style, seconds[keep], error[keep], *ends)
 
 
