@@ -58,13 +58,16 @@ def need_of(v: Tensor) -> str:
     return "direct" if bool(low == 1) else "scattered" if bool(high == 0) else "both"
 
 
-def mixture_fields(theta_r: Tensor, log_weights: Tensor, mode: Tensor, below: Tensor, above: Tensor) -> Tensor:
-    """`[F, K, B]` of `layout.FIELDS` for weights, modes and widths `[K, B]`.
+def mixture_fields(theta_r: Tensor, given: tuple[Tensor, ...], components: list[int]) -> Tensor:
+    """`[F, K, B]` of `layout.FIELDS` for the K components among log weights, modes and widths below and above, each
+    `[B, all]`.
 
     Each piece of a two-piece normal law is a normal law between a near and a far end. A mode that lies more than 4
     widths outside what can be reached is moved to 4 widths, with the width that keeps the logarithmic slope at the
     border: the piece is an exponential law in either case, and its tail stays within the range of float32.
     """
+    log_weights, mode, below, above = (x[:, components].t() for x in given)
+    log_weights = log_weights.clamp_min(-1e30)
     low, high = reachable(theta_r)
     split = torch.minimum(torch.maximum(mode, low), high)
     over, under = (mode - split).clamp_min(0), (split - mode).clamp_min(0)
@@ -72,8 +75,8 @@ def mixture_fields(theta_r: Tensor, log_weights: Tensor, mode: Tensor, below: Te
     mode = split + torch.minimum(over, _REACH * below) - torch.minimum(under, _REACH * above)
     root = math.sqrt(0.5)
     inverse_below, inverse_above = root / below, root / above
-    near_left, far_left = torch.erfc((mode - split) * inverse_below), torch.erfc((mode - low) * inverse_below)
-    near_right, far_right = torch.erfc((split - mode) * inverse_above), torch.erfc((high - mode) * inverse_above)
+    near_left, far_left = (_tails((mode - x) * inverse_below) for x in (split, low))
+    near_right, far_right = (_tails((x - mode) * inverse_above) for x in (split, high))
     left = torch.where(split > low, below * (near_left - far_left), 0.0)
     right = torch.where(split < high, above * (near_right - far_right), 0.0)
     mass = left + right
@@ -91,6 +94,11 @@ def mixture_fields(theta_r: Tensor, log_weights: Tensor, mode: Tensor, below: Te
         "near_right": near_right,
     }
     return torch.stack([found[name] for name in FIELDS])
+
+
+def _tails(x: Tensor) -> Tensor:
+    """2 Q of sqrt(2) x; pieces that are empty may ask for x < 0."""
+    return torch.erfc(x.clamp_min(0))
 
 
 def _limited(width: Tensor, distance: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dsfit.kernels.contexts import mixture_fields
 from dsfit.kernels.density import density, log_density
 from dsfit.kernels.draw import draw
 from dsfit.kernels.evaluate import evaluate
@@ -35,12 +36,13 @@ class Tables:
 @dataclass(frozen=True)
 class Functions:
     """`context` is theta_r, n, v; `mixture` is fields and sphere; directions are `[S, B]` or `[N]` with contexts `[B]`
-    or `[1]`."""
+    or `[1]`. `fields` writes `contexts.mixture_fields`."""
 
     eval: Callable[..., Tensor]
     log_prob: Callable[..., Tensor]
     sample: Callable[..., tuple[Tensor, Tensor]]
     sample_eval: Callable[..., tuple[Tensor, ...]]
+    fields: Callable[..., None]
 
 
 def plain_functions(layout: Layout) -> Functions:
@@ -72,4 +74,7 @@ def plain_functions(layout: Layout) -> Functions:
         value = evaluate(layout, constants, averages, context, direction, cells, theta_i)
         return theta_i, phi, pdf, torch.stack(value)
 
-    return Functions(evaluated, log_prob, sample, sample_eval)
+    def fields(theta_r: Tensor, given: tuple[Tensor, ...], components: list[int], out: Tensor) -> None:
+        out.copy_(mixture_fields(theta_r, given, components))
+
+    return Functions(evaluated, log_prob, sample, sample_eval, fields)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,17 +16,26 @@ from dsfit.bsdf.terms import TERMS, Terms
 from dsfit.context import Context
 from dsfit.errors import InputError, as_real, check_choice
 from dsfit.kernels.adapters import KernelIntegrand, KernelProposal
-from dsfit.kernels.contexts import Contexts, mixture_fields, need_of
+from dsfit.kernels.contexts import Contexts, need_of
 from dsfit.kernels.functions import Functions, plain_functions
-from dsfit.kernels.layout import NEEDS, Layout
+from dsfit.kernels.layout import FIELDS, NEEDS, Layout
 from dsfit.kernels.native import NoCompiler, native_functions
 from dsfit.kernels.program import Program, build_program
 from dsfit.kernels.tables import Grid, average_table, azimuth_columns, check_served, law_tables
 from dsfit.proposals.amortised import AmortisedProposal
 from dsfit.scene.lights import Light
 
+_AT_ONCE = 1024  # contexts that are prepared at once: their intermediate numbers stay in cache
 _FINER = (2, 1)
 """Cells of the records in one cell of the proposal's azimuth tables, in theta_diff and in phi."""
+
+
+class _Plain(NamedTuple):
+    """What a proposal's shape is asked for, known to be valid."""
+
+    theta_r: Tensor
+    n: Tensor
+    v: Tensor
 
 
 class HairKernel:
@@ -33,7 +43,7 @@ class HairKernel:
 
     Args:
         bsdf: a round `marschner` fibre in the "consistent" form of the equations.
-        proposal: what is sampled; left out, an untrained `AmortisedProposal`. Its parameters are read at `prepare`.
+        proposal: what is sampled; left out, an untrained `AmortisedProposal`. A copy is kept as it is now.
         terms: which terms of F are computed.
         mode: "compiled" (C++, built for this machine at first use and cached), "eager" (torch), or "auto": compiled
             where there is a compiler, else eager. `backend` tells which, and why.
@@ -73,6 +83,7 @@ class HairKernel:
         self.grid = Grid((rows - 1) * _FINER[0] + 1, (columns - 1) * _FINER[1] + 1)
         self.columns = azimuth_columns(own, self.grid)
         self.averages = average_table(own)
+        self._snapshot = copy.deepcopy(self.mixture).to(torch.float32).requires_grad_(False)
         self._sphere = torch.tensor(self.mixture.defensive / (4 * math.pi), dtype=torch.float32)
         self._programs: dict[str, Program] = {}
         self._program("both")
@@ -100,18 +111,21 @@ class HairKernel:
 
     def prepare(self, theta_r: Any, n: Any = 0.0, v: Any = None) -> Contexts:
         """Everything that depends on the context alone, for contexts `[B]` (see `Context` for what is allowed)."""
-        context = Context(*(None if x is None else as_real("context", x, torch.float32) for x in (theta_r, 0.0, n, v)))
-        return self.prepare_context(context.reshape(-1))
+        given = (None if x is None else as_real("context", x, torch.float32) for x in (theta_r, 0.0, n, v))
+        return self.prepare_context(Context(*given).reshape(-1))
 
+    @torch.no_grad()
     def prepare_context(self, context: Context) -> Contexts:
         """`prepare` for a `Context` of batch shape `[B]`."""
         bare = self.bare_contexts(context)
         program = self._program(bare.need)
-        with torch.no_grad():
-            shape = self.mixture.shape(context.to(torch.float32))
-            parts = (shape.log_weights, shape.mode, shape.below, shape.above)
-            rows = [x[..., program.components].t().contiguous() for x in parts]
-            return dataclasses.replace(bare, fields=mixture_fields(bare.theta_r, *rows))
+        fields = bare.theta_r.new_empty(len(FIELDS), len(program.components), len(bare))
+        for start in range(0, len(bare), _AT_ONCE):
+            some = slice(start, start + _AT_ONCE)
+            shape = self._snapshot.shape(_Plain(bare.theta_r[some], bare.n[some], bare.v[some]))
+            given = (shape.log_weights, shape.mode, shape.below, shape.above)
+            program.run.fields(bare.theta_r[some], given, program.components, fields[..., some])
+        return dataclasses.replace(bare, fields=fields)
 
     def bare_contexts(self, context: Context) -> Contexts:
         """Contexts that `eval` takes, without a mixture."""

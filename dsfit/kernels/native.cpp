@@ -24,6 +24,13 @@ INLINE V number(I x) { return __builtin_convertvector(x, V); }
 INLINE I whole(V x) { return __builtin_convertvector(x, I); }
 INLINE I imin(I a, I b) { return a < b ? a : b; }
 
+// x * x - square exactly
+INLINE V fused_rest(V x, V square) {
+    V r;
+    for (int l = 0; l < W; l++) r[l] = __builtin_fmaf(x[l], x[l], -square[l]);
+    return r;
+}
+
 #if defined(__AVX512F__)
 INLINE V root(V x) { return (V)_mm512_sqrt_ps((__m512)x); }
 INLINE V take(const float* p, I i) { return (V)_mm512_i32gather_ps((__m512i)i, p, 4); }
@@ -165,6 +172,23 @@ INLINE V third(const V* x, int k) {
     V front = __builtin_shuffle(x[0], x[1], wanted & 31);
     V back = __builtin_shuffle(x[2], x[2], wanted & 15);
     return wanted < 2 * W ? front : back;
+}
+
+// erfc(x) for x >= 0 with relative error 1.2e-7 (Press et al., Numerical Recipes, section 6.2)
+INLINE V complementary(V x) {
+    V t = 2.0f / (2.0f + x);
+    V p = 0.17087277f * t - 0.82215223f;
+    p = p * t + 1.48851587f;
+    p = p * t - 1.13520398f;
+    p = p * t + 0.27886807f;
+    p = p * t - 0.18628806f;
+    p = p * t + 0.09678418f;
+    p = p * t + 0.37409196f;
+    p = p * t + 1.00002368f;
+    p = p * t - 1.26551223f;
+    V square = x * x;  // rounded off in the exponent, so that what is lost is put back
+    V lost = fused_rest(x, square);
+    return t * expo(p - square) * (1.0f - lost);
 }
 
 struct Tables {
@@ -507,6 +531,42 @@ static void run_sample_eval(const Tables& t, const Context& c, int64_t s, int64_
     });
 }
 
+INLINE V limited(V width, V distance) {
+    V reach = 4.0f * width;
+    return distance > reach ? reach * width / distance : width;
+}
+
+// contexts.mixture_fields: sixteen contexts from b on, one component after the other; `given` are log weights, modes and
+// widths below and above, each [B, `all`], of which the components `which` are taken; rows of `out` hold `total` contexts
+static void run_fields(const float* theta_r, const float* const* given, const int32_t* which, int64_t every,
+                       int64_t count, int64_t total, float* out) {
+    for (int64_t block = 0; block < count; block += W) {
+        int64_t b = block + W > count ? count - W : block;
+        V half = load(theta_r + b) * 0.5f, low = half - 0.785398163f, high = half + 0.785398163f, edge{};
+        for (int k = 0; k < K; k++) {
+            V x[4];
+            for (int f = 0; f < 4; f++)
+                for (int l = 0; l < W; l++) x[f][l] = given[f][(b + l) * every + which[k]];
+            V mode = x[1], split = vmin(vmax(mode, low), high);
+            V over = vmax(mode - split, V{}), under = vmax(split - mode, V{});
+            V below = limited(x[2], over), above = limited(x[3], under);
+            mode = split + vmin(over, 4.0f * below) - vmin(under, 4.0f * above);
+            V inverse_below = 0.707106781f / below, inverse_above = 0.707106781f / above;
+            V near_left = complementary(vmax(mode - split, V{}) * inverse_below);
+            V far_left = complementary(vmax(mode - low, V{}) * inverse_below);
+            V near_right = complementary(vmax(split - mode, V{}) * inverse_above);
+            V far_right = complementary(vmax(high - mode, V{}) * inverse_above);
+            V left = split > low ? below * (near_left - far_left) : V{};
+            V right = split < high ? above * (near_right - far_right) : V{};
+            V mass = left + right, log_weight = vmax(x[0], all(-1e30f));
+            edge += expo(log_weight);
+            V found[10] = {mode,     inverse_below, inverse_above, log_weight - logarithm(5.01325655f * mass), edge,
+                           left / mass, far_left,   near_left,     far_right, near_right};
+            for (int f = 0; f < 10; f++) store(out + (f * K + k) * total + b, found[f]);
+        }
+    }
+}
+
 extern "C" {
 void dsfit_eval(const Tables* t, const Context* c, int64_t s, int64_t b, const float* theta, const float* phi,
                 float* out) {
@@ -524,5 +584,9 @@ void dsfit_sample_eval(const Tables* t, const Context* c, int64_t s, int64_t b, 
                        float* phi, float* pdf, float* out) {
     c->count == 1 ? run_sample_eval<true>(*t, *c, s, b, u, theta, phi, pdf, out)
                   : run_sample_eval<false>(*t, *c, s, b, u, theta, phi, pdf, out);
+}
+void dsfit_fields(const float* theta_r, const float* const* given, const int32_t* which, int64_t every, int64_t count,
+                  int64_t total, float* out) {
+    run_fields(theta_r, given, which, every, count, total, out);
 }
 }

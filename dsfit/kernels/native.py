@@ -15,8 +15,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from dsfit.kernels.contexts import mixture_fields
 from dsfit.kernels.functions import Functions
-from dsfit.kernels.layout import GUIDE, LOBES, Layout
+from dsfit.kernels.layout import BLOCK, GUIDE, LOBES, Layout
 
 _FLAGS = ("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast",
           "-Wno-psabi", "-shared", "-fPIC")  # fmt: skip
@@ -167,4 +168,14 @@ def native_functions(layout: Layout) -> Functions:
         call("dsfit_sample_eval", t, c, shape, u, theta_i, phi, pdf, out)
         return theta_i, phi, pdf, out
 
-    return Functions(evaluated, log_prob, sample, sample_eval)
+    def fields(theta_r, given, components, out):  # noqa: ANN001, ANN202
+        if len(theta_r) < BLOCK:
+            out.copy_(mixture_fields(theta_r, given, components))
+            return
+        given = [x.contiguous() for x in given]
+        pointers = (ctypes.c_void_p * 4)(*(x.data_ptr() for x in given))
+        which = (ctypes.c_int32 * len(components))(*components)
+        sizes = (ctypes.c_int64(x) for x in (given[0].shape[1], len(theta_r), out.stride(1)))
+        code.dsfit_fields(ctypes.c_void_p(theta_r.data_ptr()), pointers, which, *sizes, ctypes.c_void_p(out.data_ptr()))
+
+    return Functions(evaluated, log_prob, sample, sample_eval, fields)

@@ -82,7 +82,6 @@ def test_draws_are_those_of_the_proposal() -> None:
     theta_i, phi = kernel.sample(kernel.prepare_context(context), u)
     reference = cases.mixture()(context.to(torch.float64)).sample(u.double())
     close = (theta_i - reference[..., 0]).abs() < 1e-4
-    inner = (u[..., 1] - 0.5).abs() < 0.498
     assert bool(close.all())
     turn = (phi.abs() - reference[..., 1].abs()).abs()
     assert float(turn[close].median()) < 2e-3

@@ -71,6 +71,7 @@ def test_terms_leave_out_exactly_what_they_say() -> None:
     assert torch.allclose(total, whole, rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_grey_terms_compute_one_channel() -> None:
     bsdf = dsfit.DualScattering(dsfit.Fiber(sigma_a=(0.2, 0.2, 0.2)), precision="table")
     kernel = HairKernel(bsdf, cases.mixture(), terms=Terms(grey=True), mode="eager")

@@ -9,6 +9,7 @@ import torch
 
 from dsfit.errors import InputError
 from dsfit.kernels import native
+from dsfit.kernels.layout import FIELDS
 from tests.kernels import cases
 
 pytestmark = pytest.mark.skipif(not cases.has_compiler(), reason="no C++ compiler")
@@ -38,6 +39,14 @@ def _agree(preset: str, v: float | None, shapes: tuple[tuple[int, int], ...]) ->
 
 def test_compiled_and_eager_agree() -> None:
     _agree("blond", None, SHAPES)
+
+
+def test_compiled_contexts_agree_with_eager_ones() -> None:
+    context = cases.contexts(70)
+    wanted = cases.kernel().prepare_context(context).fields
+    found = cases.kernel(mode="compiled").prepare_context(context).fields
+    for k, name in enumerate(FIELDS):
+        assert torch.allclose(found[k], wanted[k], rtol=1e-4, atol=1e-5), name
 
 
 @pytest.mark.slow
