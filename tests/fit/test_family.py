@@ -96,3 +96,17 @@ def test_bad_input_is_told(proposal: FamilyProposal, options: dict) -> None:
 def test_something_else_is_told() -> None:
     with pytest.raises(InputError):
         train_family("hair")  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_excess_of_an_eccentric_fibre_is_the_mean_over_orientations(proposal: FamilyProposal) -> None:
+    """Direct light, which the adaptive quadrature evaluates without tables; a mean over 4 orientations of either."""
+    bsdf = dsfit.DualScattering(dsfit.Fiber(sigma_a=(0.05, 0.1, 0.2), eccentricity=0.88))
+    stream = dsfit.ContextStream(theta="angle", direct=1.0)
+    made = family_targets(proposal, [bsdf], stream, 1, 1, torch.Generator().manual_seed(4), dtype=torch.float64)
+    used = float(family_excess(proposal, made))
+    one = made.targets.context.reshape(-1)[0]
+    turned = [dsfit.Context(one.theta_r, (k + 0.5) * torch.pi / 4, one.n, one.v) for k in range(4)]
+    member = proposal.of(bsdf, extrapolate=True)
+    exact = [float(dsfit.excess(dsfit.Integrand(bsdf), member, context, 1e-2).value) for context in turned]
+    assert abs(sum(exact) / 4 - used) < 0.05 * used + 1e-4, (exact, used)

@@ -150,9 +150,7 @@ def _joined(parts: list[Targets]) -> Targets:
         new[:, : x.shape[1], : x.shape[2]] = x
         return new
 
-    fields = [
-        torch.cat([padded(getattr(x, name)) for x in parts]) for name in ("theta", "weight", "target", "azimuth")
-    ]
+    fields = [torch.cat([padded(getattr(x, name)) for x in parts]) for name in ("theta", "weight", "target", "azimuth")]
     contexts = [torch.cat([getattr(x.context, name) for x in parts]) for name in ("theta_r", "phi_r", "n", "v")]
     return Targets(Context(*contexts), *fields)
 
