@@ -10,9 +10,11 @@ import pytest
 import torch
 
 import dsfit
+from dsfit.race.peer import Problem
 from dsfit.race.peers.flow import ZukoFlow
 from dsfit.race.peers.flow_density import FlowDistribution, FlowProposal
 from dsfit.race.peers.flow_training import draw_pool
+from dsfit.streams import ContextStream
 from tests.race.peers_support import CONTEXTS, estimates, integrand, is_centred, problem, ready, root_mean_square
 
 pytest.importorskip("zuko")
@@ -94,6 +96,15 @@ def test_the_pool_is_weighted_to_the_integrand() -> None:
     exact = float(((value * torch.cos(grid[:, 1:])).sum(0) / value.sum(0)).mean())
     found = float((few[0] * torch.cos(few[1][..., 1])).mean())
     assert abs(found - exact) < 0.02
+
+
+def test_contexts_without_light_do_not_spoil_the_pool() -> None:
+    """Black hair behind thirty fibres: a_f^n underflows in float32."""
+    dark = dsfit.Integrand(dsfit.DualScattering(dsfit.Fiber.preset("black"), precision="table"))
+    stream = ContextStream(direct=0.0, n_mean=20.0, rule="threshold")
+    pool = draw_pool(Problem(dark, stream), 1, torch.Generator().manual_seed(7))
+    assert bool(pool.weight.isfinite().all())
+    assert bool((pool.weight.reshape(64, 256) == 0).all(0).any()) and bool((pool.weight > 0).any())
 
 
 def test_state_is_loaded_with_its_time_and_refused_elsewhere(tmp_path: Path) -> None:

@@ -41,7 +41,8 @@ def draw_pool(problem: Problem, count: int, generator: torch.Generator) -> Pool:
             u = uniforms(shape, distribution.dimension, generator=generator, kind="sobol", dtype=problem.dtype)
             omega, log_p = distribution.sample_with_log_prob(u)
             weight = torch.linalg.vector_norm(problem.integrand(omega, context), dim=-1) * torch.exp(-log_p)
-            weight = weight / weight.mean(0)
+            mean = weight.mean(0)  # 0 where no light arrives in this dtype: such contexts teach nothing
+            weight = torch.where(mean > 0, weight / mean.clamp_min(torch.finfo(mean.dtype).tiny), 0.0)
             parts.append((context.expand(*shape).reshape(-1), omega.reshape(-1, 2), weight.reshape(-1)))
     fields = [torch.cat([getattr(c, name) for c, _, _ in parts]) for name in ("theta_r", "phi_r", "n", "v")]
     return Pool(Context(*fields), torch.cat([x for _, x, _ in parts]), torch.cat([x for _, _, x in parts]))
