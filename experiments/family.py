@@ -261,7 +261,7 @@ def plot(folder: Path) -> list[Path]:
         where.plot([], [], "o", color=COLORS[0], ms=4, label="median")
         where.plot([], [], "^", color=COLORS[0], ms=4, label="p99")
         where.plot([], [], "o", color=COLORS[0], mfc="white", ms=4, label="eccentric")
-        where.set(xscale="log", yscale="log", xlabel="largest $\\sigma_a$ (left end: 0)", ylabel="excess, one fibre")
+        where.set(xscale="log", yscale="log", xlabel="largest σ_a (left end: 0)", ylabel="excess, one fibre")
         for axis in (spread, curve, where):
             axis.legend(frameon=False, fontsize=7)
             axis.grid(True)
