@@ -3,7 +3,7 @@ the best mix of the chapter's proposals.
 
     python experiments/family.py [FOLDER] [--small]
 
-computes `family.json`, `family.npz` and the trained `family_proposal.npz` in FOLDER (default runs/family; some five
+computes `family.json`, `family.npz` and the trained `family_proposal.npz` in FOLDER (default runs/family; several
 minutes of one core), draws `family.png` and `family.pdf` from the first two, and prints the tables. `--small` is a
 trial of a minute, whose numbers mean nothing.
 """

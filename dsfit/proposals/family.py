@@ -66,7 +66,7 @@ class FamilyProposal(Proposal):
     """One proposal for all fibres of a family: `family.of(bsdf)` is the proposal of one of them, without training.
 
     What concerns one lobe of one fibre is tabulated (azimuths given theta_diff, energies, means and widths at every
-    inclination and depth; some 0.3 s for a round section, 0.8 s else); how the lobes of a mixture best share the
+    inclination and depth; some 0.4 s for a round section, 1 s else); how the lobes of a mixture best share the
     integrand is the network's, trained once for the family by `dsfit.fit.amortise.family.train_family`.
 
     Args:
