@@ -11,6 +11,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from matplotlib.ticker import NullFormatter
+
 from dsfit.experiment.plots.style import COLORS, new_figure, save, styled
 
 
@@ -49,22 +51,25 @@ def plot(folder: Path) -> list[Path]:
                 _curves(axes, row["methods"]["gauss_newton"], column, COLORS[k % len(COLORS)], row["quadrature"])
             axes.set(xscale="log", yscale="log", xlabel=label, ylabel="excess / excess of the quadrature fit")
             axes.axhline(1.0, color="black", linewidth=0.8)
-            axes.set_title("no noise: Gauss-Newton on samples; squares: quadrature fit")
+            axes.set_title("no noise; squares: quadrature fit")
         for k, row in enumerate(noisy):
             for name, style in (("gauss_newton", "-"), ("gauss_newton, two draws", "--")):
                 _curves(grid[0, 2], row["methods"][name], 0, COLORS[k], None, style,
                         f"{row['preset']}, {row['noise']}, {'two draws' if 'two' in name else 'one draw'}")  # fmt: skip
             grid[0, 2].axhline(row["quadrature"]["excess"], color=COLORS[k], linewidth=0.6, linestyle=":")
         grid[0, 2].set(xscale="log", yscale="log", xlabel="evaluations of the integrand", ylabel="excess")
-        grid[0, 2].set_title("noisy light; dotted: quadrature fit, no noise")
+        grid[0, 2].set_title("noisy light; dotted: without noise")
         grid[0, 2].legend(fontsize=6)
         _bars(grid[1, 0], rows)
-        if "stream" in data:
-            _stream(grid[1, 1], data["stream"])
-        if "gradients" in data:
-            _factors(grid[1, 2], data["gradients"])
+        for axes, name, panel in ((grid[1, 1], "stream", _stream), (grid[1, 2], "gradients", _factors)):
+            if name in data:
+                panel(axes, data[name])
+            else:
+                axes.set_visible(False)
         for axes in grid.flat:
             axes.grid(True)
+            if axes.get_yscale() == "log":
+                axes.yaxis.set_minor_formatter(NullFormatter())
         return save(figure, folder, "stochastic_fit")
 
 
@@ -86,6 +91,7 @@ def _curves(
 def _bars(axes: Any, rows: list[dict[str, Any]]) -> None:
     """Where every method ended."""
     names = ["quadrature", "gauss_newton", "gauss_newton, two draws", "adam"]
+    named = set()
     for k, name in enumerate(names):
         for i, row in enumerate(rows):
             runs = [row["quadrature"]] if name == "quadrature" else row["methods"].get(name, [])
@@ -94,15 +100,16 @@ def _bars(axes: Any, rows: list[dict[str, Any]]) -> None:
                 x = i + 0.18 * (k - 1.5)
                 axes.plot([x, x], [found[0], found[-1]], color=COLORS[k], linewidth=1.5)
                 axes.plot([x], [statistics.median(found)], "o", color=COLORS[k], markersize=3.5,
-                          label=name if i == len(rows) - 1 else None)  # fmt: skip
+                          label=None if name in named else name)  # fmt: skip
+                named.add(name)
     for i, row in enumerate(rows):
         label = None if i else "start"
         axes.plot([i - 0.4, i + 0.4], [row["start"]] * 2, color="#8c8c8c", linewidth=1.0, label=label)
     labels = [f"{row['preset']} {row['theta']:g}° {row['n']:g}" + (" lobe" if row["light"] != "furnace" else "")
               + (f" {row['noise']}" if row["noise"] else "") for row in rows]  # fmt: skip
-    axes.set_xticks(range(len(rows)), labels, rotation=60, ha="right", fontsize=6)
+    axes.set_xticks(range(len(rows)), labels, rotation=90, fontsize=5.5)
     axes.set(yscale="log", ylabel="excess")
-    axes.set_title("where each fit ended (seeds: median, range)")
+    axes.set_title("where fits ended: median, range")
     axes.legend(fontsize=6)
 
 
@@ -112,7 +119,7 @@ def _stream(axes: Any, data: dict[str, Any]) -> None:
     for name, pick, color in (("worst", max, COLORS[1]), ("median", statistics.median, COLORS[0])):
         axes.plot(x, [pick(values) for _, _, values in data["curve"]], "o-", color=color, label=name, markersize=3.5)
     axes.set(xscale="log", yscale="log", xlabel="evaluations of the integrand", ylabel="excess")
-    axes.set_title(f"amortised proposal, blond: {data['contexts']} contexts not trained on")
+    axes.set_title(f"amortised, {data['contexts']} other contexts")
     axes.legend()
 
 
@@ -123,7 +130,7 @@ def _factors(axes: Any, factors: dict[str, list[float]]) -> None:
         axes.plot([i], [factor], "o", color=COLORS[0])
     axes.set_xticks(range(len(factors)), list(factors), rotation=30, ha="right")
     axes.set(yscale="log", ylabel="variance of plain / variance")
-    axes.set_title("gradient, equal evaluations (95 % intervals)")
+    axes.set_title("gradient: 95 % intervals")
 
 
 if __name__ == "__main__":
