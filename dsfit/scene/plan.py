@@ -92,12 +92,10 @@ class Plan:
         return (*lobes, *(["back"] if any(name == "back" for _, name in self.kept) else []))
 
     def prune(self, proposal: Proposal, context: Context, **options: Any) -> Pruned:
-        """A mixture without the lobes of what went and without what does not pay; see `plan_proposal.prune`."""
+        """A mixture without what does not pay for sampling what is kept; see `plan_proposal.prune`."""
         from dsfit.scene.plan_proposal import prune
 
-        lobes = {f"{name}{tail}" for name in ("R", "TT", "TRT") for tail in ("", "_scattered")} | {"back"}
-        gone = lobes - set(self.components)
-        return prune(proposal, self.integrand, context, needed=lambda name: name not in gone, **options)
+        return prune(proposal, self.integrand, context, **options)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data, for result files."""

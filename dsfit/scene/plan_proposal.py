@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -68,9 +68,8 @@ def prune(
     integrand: Integrand,
     context: Context,
     *,
-    needed: Callable[[str], bool] | None = None,
     costs: Sequence[float] | None = None,
-    base: float = 2.0,
+    base: float = 8.0,
 ) -> Pruned:
     """Leave out the components whose cost is more than they save in variance, over all the contexts given.
 
@@ -84,9 +83,9 @@ def prune(
         proposal: a mixture.
         integrand: what is sampled, planned or not.
         context: contexts that matter.
-        needed: whether a component of this name may be needed at all; those that may not go first.
         costs: of one density evaluation of each component, in any unit; equal if left out.
-        base: cost of a sample besides, in the same unit.
+        base: cost of a sample besides, in the same unit; drawing and weighing a sample was measured to cost as much as
+            8 components, on one core in float64, without the integrand.
 
     Raises:
         InputError: no mixture, another number of costs than components, costs that are not positive.
@@ -101,10 +100,10 @@ def prune(
         price = check_range("costs", price, 0.0, open_low=True)
         base = as_number("base", base, 0.0)
         names = _names(proposal, count)
-        keep = [k for k, name in enumerate(names) if needed is None or needed(name) or name == "defensive"]
+        keep = list(range(count))
         tables = [_table(proposal, integrand, context[i]) for i in range(len(context))]
         best = _score(tables, keep, price, base)
-        start = _score(tables, list(range(count)), price, base)
+        start = best
         while len(keep) > 1:
             free = [k for k in keep if names[k] != "defensive"]
             tried = {k: _score(tables, [j for j in keep if j != k], price, base) for k in free}
