@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 GROUPS = ("stream", "contexts")
 LEVEL = 1e-6
 """A peer fails where estimates are centred on the truth with a smaller probability than this, in either group."""
-_CHECKED = 6
+_CHECKED = 4
 _REFERENCE_ERROR = 1e-4
 _NODES_RTOL = 1e-4
 _ALLOWANCE = {torch.float32: 1e-4, torch.float64: 2e-5}

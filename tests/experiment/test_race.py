@@ -8,16 +8,19 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from dsfit.cli import app
 from dsfit.context import Context
+from dsfit.errors import InputError
 from dsfit.experiment import race, runner
 from dsfit.experiment.plots.race import _spread_out
 from dsfit.experiment.plots.race import race as figure_of
 from dsfit.experiment.race_report import markdown, table, winner_table
 from dsfit.experiment.race_summary import entrants, rows, winners
 from dsfit.experiment.reader import ConfigError
+from dsfit.experiment.rundir import RunDirectory
 from dsfit.experiment.validation import load
 from dsfit.race import registry
 from dsfit.race.peer import Sampler
@@ -168,13 +171,13 @@ def test_an_interrupted_race_goes_on_and_keeps_what_was_done(config: Path, monke
     folder = runner.run_directory(experiment).path / "cells"
     before = {p.name: p.stat().st_mtime_ns for p in folder.iterdir()}
     assert {"0000.json", "0001.json", "0002.json"} < set(before) and "0003.json" not in before
-    race._COURSES.clear()
     race._READY.clear()
     outcome = runner.run(experiment, workers=0)
     assert len(outcome.result["cells"]) == 4
     assert all((folder / name).stat().st_mtime_ns == time for name, time in before.items())
 
 
+@pytest.mark.slow
 def test_a_peer_off_the_truth_fails_loses_and_sets_the_exit_code(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = registry.make
     monkeypatch.setattr(registry, "make", lambda kind, options=None: Crooked() if kind == "uniform" else real(kind))
@@ -201,6 +204,40 @@ def test_a_peer_whose_package_is_missing_says_so_and_the_race_goes_on(
     assert all(cell["skipped"] == "not installed: no_such_package" for cell in found["cells"])
     assert "not run: not installed: no_such_package" in markdown(found)
     assert rows(found)[0]["skipped"] and figure_of(found).axes
+
+
+def test_a_cell_off_the_truth_is_biased_and_one_that_knows_too_little_untested() -> None:
+    def cell(*points: tuple[bool, float]) -> dict[str, Any]:
+        return {"stream": {"points": [{"tested": tested, "p_value": p} for tested, p in points]}}
+
+    assert race._verdict(cell((True, 1e-9), (True, 0.5)))["verdict"] == "biased"
+    assert race._verdict(cell((True, 1e-4), (True, 0.5)))["verdict"] == "unbiased"
+    assert race._verdict(cell((False, 1e-9)))["verdict"] == "untested"
+
+
+def test_integrals_of_the_stream_are_computed_once_per_run_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Once:
+        def __init__(self, integrand: Any) -> None:
+            pass
+
+        def check(self, contexts: Context) -> float:
+            return 1e-7
+
+        def __call__(self, contexts: Context) -> torch.Tensor:
+            return contexts.n.unsqueeze(-1)
+
+    contexts, directory = Context([0.1, 0.2], 0.0, [1.0, 2.0]), RunDirectory(tmp_path)
+    monkeypatch.setattr(race, "StreamReference", Once)
+    first = race._stream_truth("key", None, contexts, directory)  # type: ignore[arg-type]
+    monkeypatch.setattr(race, "StreamReference", None)
+    again = race._stream_truth("key", None, contexts, directory)  # type: ignore[arg-type]
+    assert torch.equal(first[0], again[0]) and first[1] == again[1] == 1e-7
+    monkeypatch.setattr(Once, "check", lambda self, contexts: 1e-3)
+    monkeypatch.setattr(race, "StreamReference", Once)
+    with pytest.raises(InputError, match="references that agree"):
+        race._stream_truth("other", None, contexts, directory)  # type: ignore[arg-type]
 
 
 def test_a_peer_with_rare_large_weights_is_marked_and_does_not_win(result: dict[str, Any]) -> None:
