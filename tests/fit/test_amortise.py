@@ -120,6 +120,12 @@ def test_held_out_contexts_are_what_they_say() -> None:
     assert bool((again.v == context.v).all())
 
 
+def test_excess_is_unknown_where_no_light_is_left() -> None:
+    context = dsfit.Context(0.3, n=torch.tensor([2.0, 1e5], dtype=torch.float64))
+    found = held_out(dsfit.Integrand(bsdf()), untrained(), context, check=0)
+    assert found.excess.isnan().tolist() == [False, True]
+
+
 def test_held_out_uses_cubature_where_there_is_no_furnace() -> None:
     from dsfit.scene.lights import ConstantLight
 

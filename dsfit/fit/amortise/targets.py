@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -18,6 +19,7 @@ from dsfit.quadrature import merge_breaks, panel_points
 from dsfit.scene.integrand import Integrand
 
 THETA_NODES, AZIMUTH_NODES = 3, 6
+_DARK = 1e-280  # below, some directions have underflown
 _GRAZING = (1.3, 1.4, 1.48, 1.53)
 
 
@@ -113,14 +115,15 @@ def best_density(
     integrand: Integrand, context: Context, theta_nodes: int, azimuth_nodes: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Nodes of contexts `[M]` with one theta_r: theta_i `[J]`, phi and weights `[J, L]`, and p* cos(theta_i)
-    `[J, L, M]` there, in float64; see `Targets`."""
+    `[J, L, M]` there, in float64; see `Targets`. nan where float64 knows no light."""
     both = Context(context.theta_r[0], 0.0, 1.0, 0.5)  # edges of direct and of scattered azimuths
     theta, theta_weight = panel_points(_breaks(integrand, both), theta_nodes)
     phi, weight = _azimuths(integrand, both, theta, azimuth_nodes)
     weight = 2 * theta_weight[:, None] * weight
     value = _values(integrand.bsdf, context, theta, phi)
     target = torch.linalg.vector_norm(value, dim=-1) * cos_inclination(theta)[:, None, None]
-    return theta, phi, weight, target / (weight[..., None] * target).sum((0, 1))
+    norm = (weight[..., None] * target).sum((0, 1))
+    return theta, phi, weight, target / norm.masked_fill(norm < _DARK, math.nan)
 
 
 def _breaks(integrand: Integrand, context: Context) -> Tensor:

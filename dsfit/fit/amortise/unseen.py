@@ -31,7 +31,7 @@ class HeldOut:
 
     Attributes:
         context: where.
-        excess: M(p)/M* - 1 `[N]`.
+        excess: M(p)/M* - 1 `[N]`; nan where no light is left in float64, such as a_f^n for n = 1e4.
         largest_weight: sup |F|/p over the nodes, in units of the mean `[N]`.
         checked: `[S, 2]`: excess by the quadrature used and by `dsfit.excess` at some of the contexts; the first of
             every `len(context) / S`.
@@ -161,4 +161,6 @@ def _excess_on_grid(integrand: Integrand, proposal: Proposal, context: Context) 
     ratio = torch.where(target > 0, target / density, 0.0)
     gap = torch.where(target > 0, (ratio - 1) * (target - density), density)
     seen = (weight > 0)[..., None]
-    return (weight[..., None] * gap).sum((0, 1)), torch.where(seen, ratio, 0.0).amax((0, 1))
+    dark = target.isnan().any(0).any(0)  # no light is left in float64
+    columns = (weight[..., None] * gap).sum((0, 1)), torch.where(seen, ratio, 0.0).amax((0, 1))
+    return columns[0].masked_fill(dark, math.nan), columns[1].masked_fill(dark, math.nan)
