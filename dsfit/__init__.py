@@ -25,6 +25,7 @@ _PUBLIC = {
     "Fiber": "dsfit.bsdf",
     "FiberFamily": "dsfit.proposals.fiber_family",
     "Fit": "dsfit.fit",
+    "HairKernel": "dsfit.kernels",
     "HeldOut": "dsfit.fit.amortise",
     "InputError": "dsfit.errors",
     "Integrand": "dsfit.scene",

@@ -225,47 +225,31 @@ INLINE Direction at(V theta_i, V phi, V theta_r) {
     return d;
 }
 
-struct Cell {
-    I first;
-    V across, along;
-};
-
-// The cell of the records; their lines are asked for at once
-INLINE Cell locate(const Tables& t, const Direction& d) {
+// Records of the sixteen directions, one quantity per row
+INLINE void look_up(const Tables& t, const Direction& d, V* rows) {
     V x = vmin(d.diff * ((ROWS - 1) / 1.57079633f), all(ROWS - 1));
     V y = vmin(d.phi * ((COLUMNS - 1) / 3.14159265f), all(COLUMNS - 1));
     I i = imin(whole(x), I{} + (ROWS - 2)), j = imin(whole(y), I{} + (COLUMNS - 2));
-    Cell cell = {i * COLUMNS + j, x - number(i), y - number(j)};
-    for (int l = 0; l < W; l++) {
-        const float* p = t.records + (int64_t)cell.first[l] * WIDTH;
-        for (int k = 0; k < 2 * WIDTH; k += W) {
-            __builtin_prefetch(p + k);
-            __builtin_prefetch(p + COLUMNS * WIDTH + k);
-        }
-    }
-    return cell;
-}
-
-// Records of the sixteen directions, one quantity per row
-INLINE void look_up(const Tables& t, const Cell& cell, V* rows) {
+    I first = i * COLUMNS + j;
+    V across = x - number(i), along = y - number(j);
 #if WIDTH == 8
     // one load holds two neighbours along phi
     V both[W];
     for (int l = 0; l < W; l++) {
-        const float* p = t.records + (int64_t)cell.first[l] * WIDTH;
+        const float* p = t.records + (int64_t)first[l] * WIDTH;
         V low = load(p), high = load(p + COLUMNS * WIDTH);
-        both[l] = low + (high - low) * cell.across[l];
+        both[l] = low + (high - low) * across[l];
     }
     transpose(both);
-    for (int k = 0; k < WIDTH; k++) rows[k] = both[k] + (both[k + WIDTH] - both[k]) * cell.along;
+    for (int k = 0; k < WIDTH; k++) rows[k] = both[k] + (both[k + WIDTH] - both[k]) * along;
 #else
     for (int part = 0; part < WIDTH / W; part++) {
         for (int l = 0; l < W; l++) {
-            const float* p = t.records + (int64_t)cell.first[l] * WIDTH + part * W;
+            const float* p = t.records + (int64_t)first[l] * WIDTH + part * W;
             V low = load(p), next_low = load(p + WIDTH);
             V high = load(p + COLUMNS * WIDTH), next_high = load(p + (COLUMNS + 1) * WIDTH);
-            V below = low + (next_low - low) * cell.along[l], above = high + (next_high - high) * cell.along[l];
-            rows[part * W + l] = below + (above - below) * cell.across[l];
+            V below = low + (next_low - low) * along[l], above = high + (next_high - high) * along[l];
+            rows[part * W + l] = below + (above - below) * across[l];
         }
         transpose(rows + part * W);
     }
@@ -441,93 +425,62 @@ INLINE void draw(const Tables& t, const Context& c, int64_t b, const float* u, V
     *phi = signed_like(outside ? even : drawn, sign);
 }
 
-#define GROUP 4
-
-struct Place {
-    int64_t context, direction;
-    Direction at;
-    Cell cell;
-};
-
-// Calls `begin(place)` and later `finish(place)` for blocks of sixteen, all samples of a block of contexts in turn; the
-// last block overlaps the one before. A group of blocks begins before the first of them is finished, so that records
-// are on their way while others are computed.
-template <typename A, typename B> INLINE void blocks(int64_t samples, int64_t batch, A begin, B finish) {
-    Place places[GROUP];
-    int waiting = 0;
+// Calls `body(context, direction)` for blocks of sixteen, all samples of a block of contexts in turn; the last block
+// overlaps the one before.
+template <typename F> INLINE void blocks(int64_t samples, int64_t batch, F body) {
     for (int64_t b = 0; b < batch; b += W) {
         int64_t start = b + W > batch ? batch - W : b;
-        for (int64_t s = 0; s < samples; s++) {
-            Place& place = places[waiting++];
-            place.context = start;
-            place.direction = s * batch + start;
-            begin(place);
-            if (waiting < GROUP) continue;
-            for (int k = 0; k < GROUP; k++) finish(places[k]);
-            waiting = 0;
-        }
+        for (int64_t s = 0; s < samples; s++) body(start, s * batch + start);
     }
-    for (int k = 0; k < waiting; k++) finish(places[k]);
 }
 
 template <bool SINGLE>
 static void run_eval(const Tables& t, const Context& c, int64_t s, int64_t b, const float* theta, const float* phi,
                      float* out) {
-    auto begin = [&](Place& p) {
-        p.at = at(load(theta + p.direction), load(phi + p.direction), of<SINGLE>(c.theta_r, p.context));
-        if (TABULATED) p.cell = locate(t, p.at);
-    };
-    blocks(s, b, begin, [&](const Place& p) {
+    blocks(s, b, [&](int64_t k, int64_t i) {
+        Direction d = at(load(theta + i), load(phi + i), of<SINGLE>(c.theta_r, k));
         V record[WIDTH], value[CHANNELS];
-        if (TABULATED) look_up(t, p.cell, record);
-        evaluate(t, p.at, record, of<SINGLE>(c.n, p.context), of<SINGLE>(c.v, p.context), value);
-        for (int q = 0; q < CHANNELS; q++) store(out + q * s * b + p.direction, value[q]);
+        if (TABULATED) look_up(t, d, record);
+        evaluate(t, d, record, of<SINGLE>(c.n, k), of<SINGLE>(c.v, k), value);
+        for (int q = 0; q < CHANNELS; q++) store(out + q * s * b + i, value[q]);
     });
 }
 
 template <bool SINGLE>
 static void run_log_prob(const Tables& t, const Context& c, int64_t s, int64_t b, const float* theta, const float* phi,
                          float* out) {
-    auto begin = [&](Place& p) {
-        p.at = at(load(theta + p.direction), load(phi + p.direction), of<SINGLE>(c.theta_r, p.context));
-        if (LAW_TABLES) p.cell = locate(t, p.at);
-    };
-    blocks(s, b, begin, [&](const Place& p) {
+    blocks(s, b, [&](int64_t k, int64_t i) {
+        Direction d = at(load(theta + i), load(phi + i), of<SINGLE>(c.theta_r, k));
         V record[WIDTH];
-        if (LAW_TABLES) look_up(t, p.cell, record);
-        V value = density<SINGLE>(c, p.context, p.at, record);
-        store(out + p.direction, logarithm(vmax(value, all(1.17549435e-38f))));
+        if (LAW_TABLES) look_up(t, d, record);
+        store(out + i, logarithm(vmax(density<SINGLE>(c, k, d, record), all(1.17549435e-38f))));
     });
 }
 
 template <bool SINGLE>
 static void run_sample(const Tables& t, const Context& c, int64_t s, int64_t b, const float* u, float* theta,
                        float* phi) {
-    blocks(s, b, [](Place&) {}, [&](const Place& p) {
+    blocks(s, b, [&](int64_t k, int64_t i) {
         V x, y;
-        draw<SINGLE>(t, c, p.context, u + 3 * p.direction, &x, &y);
-        store(theta + p.direction, x);
-        store(phi + p.direction, y);
+        draw<SINGLE>(t, c, k, u + 3 * i, &x, &y);
+        store(theta + i, x);
+        store(phi + i, y);
     });
 }
 
 template <bool SINGLE>
 static void run_sample_eval(const Tables& t, const Context& c, int64_t s, int64_t b, const float* u, float* theta,
                             float* phi, float* pdf, float* out) {
-    auto begin = [&](Place& p) {
-        V x, y;
-        draw<SINGLE>(t, c, p.context, u + 3 * p.direction, &x, &y);
-        store(theta + p.direction, x);
-        store(phi + p.direction, y);
-        p.at = at(x, y, of<SINGLE>(c.theta_r, p.context));
-        p.cell = locate(t, p.at);
-    };
-    blocks(s, b, begin, [&](const Place& p) {
-        V record[WIDTH], value[CHANNELS];
-        look_up(t, p.cell, record);
-        store(pdf + p.direction, density<SINGLE>(c, p.context, p.at, record));
-        evaluate(t, p.at, record, of<SINGLE>(c.n, p.context), of<SINGLE>(c.v, p.context), value);
-        for (int q = 0; q < CHANNELS; q++) store(out + q * s * b + p.direction, value[q]);
+    blocks(s, b, [&](int64_t k, int64_t i) {
+        V x, y, record[WIDTH], value[CHANNELS];
+        draw<SINGLE>(t, c, k, u + 3 * i, &x, &y);
+        store(theta + i, x);
+        store(phi + i, y);
+        Direction d = at(x, y, of<SINGLE>(c.theta_r, k));
+        look_up(t, d, record);
+        store(pdf + i, density<SINGLE>(c, k, d, record));
+        evaluate(t, d, record, of<SINGLE>(c.n, k), of<SINGLE>(c.v, k), value);
+        for (int q = 0; q < CHANNELS; q++) store(out + q * s * b + i, value[q]);
     });
 }
 

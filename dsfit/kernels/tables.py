@@ -17,7 +17,7 @@ from dsfit.proposals.amortised import AmortisedProposal
 from dsfit.proposals.conditional import FiberAzimuth
 
 AVERAGES = ("log a_f", "beta_f^2", "A_b", "Delta_b", "sigma_b^2")
-_KNOTS = 513
+_KNOTS = 1025
 _TINY = 1e-30
 
 
