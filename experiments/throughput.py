@@ -9,7 +9,7 @@ throughput.json, throughput.png, throughput.pdf and throughput.md.
 What is compared differs: `hair` is one fibre (four lobes in closed form, no scattering among fibres); dsfit evaluates
 Marschner's fibre with its roots and caustic, the same lobes widened by scattering, and back scattering, of 8 or 9
 components in the mixture that it draws from. Mitsuba takes unit vectors, dsfit angles: "to_angles" is what a
-conversion costs. Times are without compiling, which the first run does, for minutes; later ones find the code on
+conversion costs. Times are without compiling, which the first run does in seconds; later ones find the code on
 disk. They include the wait for the result.
 """
 
