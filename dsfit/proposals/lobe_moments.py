@@ -24,6 +24,9 @@ _DEPTHS = (0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0, 22.0, 
            4096.0, 16384.0)  # fmt: skip
 _ROWS, _POINTS = 181, 5
 _SIDE, _STEEP = 0.7, 7.0
+_GRAZING = [sign * x for x in (1.26, 1.32, 1.38, 1.42, 1.46, 1.49, 1.52, 1.54, 1.555) for sign in (-1.0, 1.0)]
+"""Panel ends where a_f^n of dark hair has peaks a few hundredths of a radian wide, which wider panels miss: log widths
+were wrong by up to 1.2, differently at every theta_r."""
 _FLOOR = -1e5
 _SKEW = 0.6
 
@@ -79,7 +82,7 @@ class LobeMoments(torch.nn.Module):
 def _row(bsdf: DualScattering, theta_r: Tensor, back: bool) -> tuple[Tensor, Tensor]:
     """Moments at one viewing inclination: direct `[4, 3 (+ 1)]`, scattered `[depths, 4, 5 (+ 1)]`."""
     fiber = bsdf.fiber
-    theta_i, weight = panel_points(theta_breaks(bsdf, theta_r), _POINTS)
+    theta_i, weight = panel_points(theta_breaks(bsdf, theta_r, _GRAZING), _POINTS)
     theta_h, diff = theta_half(theta_i, theta_r), theta_diff(theta_i, theta_r)
     average = bsdf.averages(theta_i)
     bent = refractions(fiber, diff, torch.full_like(diff, math.pi / 4))

@@ -11,7 +11,7 @@ import torch
 
 import dsfit
 from dsfit.fit.amortise import held_out
-from dsfit.proposals import AmortisedProposal
+from dsfit.proposals import AmortisedProposal, lobe_moments
 from tests.proposals.cases_amortised import _random as changed
 from tests.proposals.cases_amortised import bsdf, untrained
 
@@ -56,6 +56,20 @@ def test_untrained_it_is_near() -> None:
     )
     for preset, limit in (("blond", 0.03), ("black", 0.1)):
         assert held_out(dsfit.Integrand(bsdf(preset)), untrained(preset), context, check=0).worst < limit
+
+
+@pytest.mark.parametrize("theta_r_deg", [-30.0, -6.0, -4.0, 0.0, 53.0])
+def test_tables_see_peaks_next_to_grazing(theta_r_deg: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Energies, modes and widths of black hair's lobes, whose a_f^n has narrow peaks there, against 20000 midpoints; to
+    n = 64, beyond which nobody is trained."""
+    theta_r = torch.tensor(math.radians(theta_r_deg), dtype=torch.float64)
+    found = lobe_moments._row(bsdf("black"), theta_r, True)
+    step = math.pi / 20000
+    nodes = (torch.arange(20000, dtype=torch.float64) + 0.5) * step - math.pi / 2
+    monkeypatch.setattr(lobe_moments, "panel_points", lambda *_: (nodes, torch.full_like(nodes, step)))
+    exact = lobe_moments._row(bsdf("black"), theta_r, True)
+    torch.testing.assert_close(found[0], exact[0], rtol=0, atol=1e-3)
+    torch.testing.assert_close(found[1][:16], exact[1][:16], rtol=0, atol=2e-3)
 
 
 @pytest.mark.parametrize(
