@@ -345,3 +345,8 @@ def test_modules_move_and_print() -> None:
     again.load_state_dict(light.state_dict())
     assert torch.equal(again(omega), light(omega))
     assert torch.equal(again.proposal()(CONTEXT).log_prob(omega), light.proposal()(CONTEXT).log_prob(omega))
+
+
+def test_a_scale_beyond_the_largest_number_is_refused() -> None:
+    with pytest.raises(InputError, match="scale"):
+        EnvironmentLight(torch.full((1, 1, 1), 1e300, dtype=torch.float64), 1e300)

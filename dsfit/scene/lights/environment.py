@@ -86,6 +86,9 @@ class EnvironmentLight(Light):
         self.name = name
         image = check_image(name, as_real(name, image))
         self.scale = as_number("scale", scale, 0.0, open_low=True)
+        largest = float(image.detach().max())
+        if not math.isfinite(self.scale * largest) or self.scale * largest > torch.finfo(image.dtype).max:
+            raise InputError("scale", scale, f"numbers whose product with the largest pixel, {largest:g}, is finite")
         self.register_buffer("image", image)
         height = image.shape[0]
         # Node values of the density by row; the poles repeat the outermost rows. Tables stay float64: they are sums of
