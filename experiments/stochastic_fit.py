@@ -4,7 +4,7 @@
     python experiments/stochastic_fit_plot.py [FOLDER]    # PNG and PDF from that file, and a table in Markdown
 
 Every fit, by samples or by quadrature, is judged on finer quadrature nodes than any fit saw. Seconds are those of the
-fit alone, with JAX compiled before, and for the quadrature those of its nodes too. About 4 minutes on a quiet machine.
+fit alone, with JAX compiled before, and for the quadrature those of its nodes too. About 5 minutes on a quiet machine.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ def plot(folder: Path) -> list[Path]:
                 _curves(axes, row["methods"]["gauss_newton"], column, COLORS[k % len(COLORS)], row["quadrature"])
             axes.set(xscale="log", yscale="log", xlabel=label, ylabel="excess / excess of the quadrature fit")
             axes.axhline(1.0, color="black", linewidth=0.8)
-            axes.set_title("no noise; squares: quadrature fit")
+            axes.set_title("a colour a scene; squares: quadrature fit")
         for k, row in enumerate(noisy):
             for name, style in (("gauss_newton", "-"), ("gauss_newton, two draws", "--")):
                 _curves(grid[0, 2], row["methods"][name], 0, COLORS[k], None, style,
