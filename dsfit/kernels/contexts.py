@@ -54,6 +54,8 @@ def _each(fields: Tensor, change: Callable[[Tensor], Tensor]) -> Tensor:
 
 def need_of(v: Tensor) -> str:
     """Which half of the integrand these contexts need."""
+    if not len(v):
+        return "both"
     low, high = torch.aminmax(v)
     return "direct" if bool(low == 1) else "scattered" if bool(high == 0) else "both"
 

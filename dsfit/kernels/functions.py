@@ -36,13 +36,21 @@ class Tables:
 @dataclass(frozen=True)
 class Functions:
     """`context` is theta_r, n, v; `mixture` is fields and sphere; directions are `[S, B]` or `[N]` with contexts `[B]`
-    or `[1]`. `fields` writes `contexts.mixture_fields`."""
+    or `[1]`. `fields` writes `contexts.mixture_fields`.
+
+    Compiled code has three more, for proposals that `moments.is_served`: `prepare` gives the fields of contexts; `sort`
+    counts (and lists) contexts by what they need, and finds those that are not valid; `shade` prepares, draws and
+    evaluates.
+    """
 
     eval: Callable[..., Tensor]
     log_prob: Callable[..., Tensor]
     sample: Callable[..., tuple[Tensor, Tensor]]
     sample_eval: Callable[..., tuple[Tensor, ...]]
     fields: Callable[..., None]
+    prepare: Callable[..., Tensor] | None = None
+    sort: Callable[..., dict[str, int] | None] | None = None
+    shade: Callable[..., None] | None = None
 
 
 def plain_functions(layout: Layout) -> Functions:

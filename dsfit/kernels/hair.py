@@ -21,6 +21,7 @@ from dsfit.kernels.functions import Functions, plain_functions
 from dsfit.kernels.layout import FIELDS, NEEDS, Layout
 from dsfit.kernels.native import NoCompiler, native_functions
 from dsfit.kernels.program import Program, build_program
+from dsfit.kernels.shade import are_plain, check_uniforms, shade
 from dsfit.kernels.tables import Grid, average_table, azimuth_columns, check_served, law_tables
 from dsfit.proposals.amortised import AmortisedProposal
 from dsfit.scene.lights import Light
@@ -83,10 +84,11 @@ class HairKernel:
         self.grid = Grid((rows - 1) * _FINER[0] + 1, (columns - 1) * _FINER[1] + 1)
         self.columns = azimuth_columns(own, self.grid)
         self.averages = average_table(own)
-        self._snapshot = copy.deepcopy(self.mixture).to(torch.float32).requires_grad_(False)
-        self._sphere = torch.tensor(self.mixture.defensive / (4 * math.pi), dtype=torch.float32)
+        self.snapshot = copy.deepcopy(self.mixture).to(torch.float32).requires_grad_(False)
+        self.sphere = self.mixture.defensive / (4 * math.pi)
+        self._sphere = torch.tensor(self.sphere, dtype=torch.float32)
         self._programs: dict[str, Program] = {}
-        self._program("both")
+        self.program("both")
 
     def functions(self, layout: Layout) -> Functions:
         """The functions of a layout: compiled, or eager where that is asked for or nothing else works."""
@@ -110,22 +112,41 @@ class HairKernel:
         return self.bsdf.channels
 
     def prepare(self, theta_r: Any, n: Any = 0.0, v: Any = None) -> Contexts:
-        """Everything that depends on the context alone, for contexts `[B]` (see `Context` for what is allowed)."""
-        given = (None if x is None else as_real("context", x, torch.float32) for x in (theta_r, 0.0, n, v))
-        return self.prepare_context(Context(*given).reshape(-1))
+        """Everything that depends on the context alone, for contexts `[B]` (see `Context` for what is allowed).
 
-    @torch.no_grad()
+        Fastest for three float32 tensors `[B]`: they are checked as they are read.
+        """
+        if are_plain(theta_r, n, v) and (sort := self.program("both").run.sort):
+            counts = sort(theta_r, n, v, None)
+            if counts is not None:
+                need = next((name for name in NEEDS[1:] if len(v) and counts[name] == len(v)), "both")
+                return self._prepared(Contexts(theta_r, n, v, theta_r.new_empty(0), self._sphere, need))
+        return self.prepare_context(self._context(theta_r, n, v))
+
     def prepare_context(self, context: Context) -> Contexts:
         """`prepare` for a `Context` of batch shape `[B]`."""
-        bare = self.bare_contexts(context)
-        program = self._program(bare.need)
-        fields = bare.theta_r.new_empty(len(FIELDS), len(program.components), len(bare))
-        for start in range(0, len(bare), _AT_ONCE):
-            some = slice(start, start + _AT_ONCE)
-            shape = self._snapshot.shape(_Plain(bare.theta_r[some], bare.n[some], bare.v[some]))
-            given = (shape.log_weights, shape.mode, shape.below, shape.above)
-            program.run.fields(bare.theta_r[some], given, program.components, fields[..., some])
+        return self._prepared(self.bare_contexts(context))
+
+    def _context(self, theta_r: Any, n: Any, v: Any) -> Context:
+        given = (None if x is None else as_real("context", x, torch.float32) for x in (theta_r, 0.0, n, v))
+        return Context(*given).reshape(-1)
+
+    def _prepared(self, bare: Contexts) -> Contexts:
+        program, given = self.program(bare.need), (bare.theta_r, bare.n, bare.v)
+        prepare = self._shaped if program.start is None else program.run.prepare
+        fields = prepare(program if program.start is None else program.start, *given)
         return dataclasses.replace(bare, fields=fields)
+
+    @torch.no_grad()
+    def _shaped(self, program: Program, theta_r: Tensor, n: Tensor, v: Tensor) -> Tensor:
+        """Fields by the proposal's own shape."""
+        fields = theta_r.new_empty(len(FIELDS), len(program.components), len(theta_r))
+        for start in range(0, len(theta_r), _AT_ONCE):
+            some = slice(start, start + _AT_ONCE)
+            shape = self.snapshot.shape(_Plain(theta_r[some], n[some], v[some]))
+            given = (shape.log_weights, shape.mode, shape.below, shape.above)
+            program.run.fields(theta_r[some], given, program.components, fields[..., some])
+        return fields
 
     def bare_contexts(self, context: Context) -> Contexts:
         """Contexts that `eval` takes, without a mixture."""
@@ -135,23 +156,41 @@ class HairKernel:
     @torch.no_grad()
     def eval(self, contexts: Contexts, theta_i: Tensor, phi: Tensor) -> Tensor:
         """F cos(theta_i) `[S, B, C]`."""
-        return self._values(self._program(contexts.need).eval(contexts, theta_i, phi))
+        return self._values(self.program(contexts.need).eval(contexts, theta_i, phi))
 
     @torch.no_grad()
     def log_prob(self, contexts: Contexts, theta_i: Tensor, phi: Tensor) -> Tensor:
         """Log density per steradian `[S, B]`."""
-        return self._program(contexts.need).log_prob(contexts, theta_i, phi)
+        return self.program(contexts.need).log_prob(contexts, theta_i, phi)
 
     @torch.no_grad()
     def sample(self, contexts: Contexts, u: Tensor) -> tuple[Tensor, Tensor]:
         """theta_i and phi `[S, B]` from uniforms."""
-        return self._program(contexts.need).sample(contexts, u)
+        return self.program(contexts.need).sample(contexts, u)
 
     @torch.no_grad()
     def sample_eval(self, contexts: Contexts, u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """theta_i, phi, their density `[S, B]` and F cos(theta_i) `[S, B, C]`."""
-        theta_i, phi, pdf, value = self._program(contexts.need).sample_eval(contexts, u)
+        theta_i, phi, pdf, value = self.program(contexts.need).sample_eval(contexts, u)
         return theta_i, phi, pdf, self._values(value)
+
+    @torch.no_grad()
+    def shade(self, theta_r: Any, n: Any, v: Any, u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """theta_i, phi, their density `[S, B]` and F cos(theta_i) `[S, B, C]` from uniforms `u` `[S, B, 3]`, as
+        `sample_eval` of contexts `[B]` that are met once.
+
+        Their mixtures never leave the cache, and every context is computed by the half it needs, whatever the others
+        need. Contexts are given as for `prepare`.
+        """
+        context = theta_r, n, v
+        if not are_plain(*context):
+            plain = self.bare_contexts(self._context(*context))
+            context = plain.theta_r, plain.n, plain.v
+        check_uniforms(u, len(context[0]))
+        found = shade(self, context, u) if self.program("both").start is not None else None
+        if found is None:
+            return self.sample_eval(self.prepare_context(self._context(*context)), u)
+        return *found[:3], self._values(found[3])
 
     def integrand(self, light: Light | None = None) -> KernelIntegrand:
         """The BSDF times a light (a furnace, if left out) where an `Integrand` is asked for."""
@@ -164,7 +203,8 @@ class HairKernel:
     def _values(self, value: Tensor) -> Tensor:
         return value.movedim(0, -1).expand(*value.shape[1:], self.channels)
 
-    def _program(self, need: str) -> Program:
+    def program(self, need: str) -> Program:
+        """What computes contexts of one kind."""
         if need not in self._programs:
             self._programs[need] = build_program(self, check_choice("need", need, NEEDS))
         return self._programs[need]

@@ -30,6 +30,8 @@ class Layout:
         channels: channels that are computed.
         direct, scattered: terms of F_direct and F_scatter, among R, TT, TRT, back.
         half_back: whether back scattering stays in |phi| < pi/2.
+        components: numbers of the proposal's components in the mixture.
+        back_lobe: whether the proposal has a lobe of back scattering.
         laws: per component of the mixture its law of azimuth: the number of a table, "all" or "back" (uniform).
         rows, columns: nodes of the record grid. Each record holds the tabulated densities of azimuth, N_TRT, N^G_R,
             N^G_TT and N^G_TRT, as far as they are needed.
@@ -41,6 +43,8 @@ class Layout:
     direct: tuple[str, ...]
     scattered: tuple[str, ...]
     half_back: bool
+    components: tuple[int, ...]
+    back_lobe: bool
     laws: tuple[int | str, ...]
     rows: int
     columns: int

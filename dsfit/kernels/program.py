@@ -12,6 +12,7 @@ from dsfit.errors import InputError
 from dsfit.kernels.contexts import Contexts
 from dsfit.kernels.functions import Functions, Tables
 from dsfit.kernels.layout import BLOCK, Layout
+from dsfit.kernels.moments import Start, is_served, packed
 from dsfit.kernels.tables import guides, refined
 from dsfit.proposals.conditional import FiberAzimuth
 from dsfit.proposals.lobe_moments import DIRECT, SCATTERED
@@ -31,10 +32,13 @@ class Program:
         tables: what is read.
         components: numbers of the proposal's components that these contexts use.
         run: the functions, on directions `[N]` with contexts `[1]` or `[N]`, or `[S, B]` with contexts `[B]`.
+        start: what compiled code prepares contexts from; None where torch does.
     """
 
-    def __init__(self, layout: Layout, tables: Tables, components: list[int], run: Functions) -> None:
-        self.layout, self.tables, self.components, self.run = layout, tables, components, run
+    def __init__(
+        self, layout: Layout, tables: Tables, components: list[int], run: Functions, start: Start | None = None
+    ) -> None:
+        self.layout, self.tables, self.components, self.run, self.start = layout, tables, components, run, start
 
     def eval(self, contexts: Contexts, theta_i: Tensor, phi: Tensor) -> Tensor:
         """Values `[C, S, B]`."""
@@ -119,6 +123,8 @@ def build_program(kernel: HairKernel, need: str) -> Program:
         direct=() if need == "scattered" else kernel.halves["direct"],
         scattered=() if need == "direct" else kernel.halves["scattered"],
         half_back=bsdf.convention.back_azimuth == "back",
+        components=tuple(components),
+        back_lobe="back" in proposal.names,
         laws=tuple(laws),
         rows=kernel.grid.rows,
         columns=kernel.grid.columns,
@@ -133,7 +139,9 @@ def build_program(kernel: HairKernel, need: str) -> Program:
         averages=_averages(kernel),
         laws=(density.float().flatten(), cumulative.flatten(), guides(cumulative).flatten()),
     )
-    return Program(layout, tensors, components, kernel.functions(layout))
+    run = kernel.functions(layout)
+    start = packed(kernel.snapshot, components) if run.prepare and is_served(kernel.snapshot) else None
+    return Program(layout, tensors, components, run, start)
 
 
 def _constants(kernel: HairKernel) -> Tensor:

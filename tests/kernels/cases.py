@@ -44,7 +44,7 @@ def kernel(preset: str = "blond", mode: str = "eager") -> HairKernel:
 @functools.cache
 def has_compiler() -> bool:
     try:
-        library(kernel()._program("both").layout)
+        library(kernel().program("both").layout)
     except NoCompiler:
         return False
     return True

@@ -21,8 +21,8 @@ LOOK_UP = {"TRT": 7e-3, "R_scattered": 4e-4, "TT_scattered": 5e-4, "TRT_scattere
 @presets
 def test_azimuths_are_within_their_bound_of_each_lobes_largest(preset: str) -> None:
     kernel, count = cases.kernel(preset), 4000
-    layout = kernel._program("both").layout
-    table = kernel._program("both").tables.records
+    layout = kernel.program("both").layout
+    table = kernel.program("both").tables.records
     u = torch.rand(2, count, generator=torch.Generator().manual_seed(1))
     theta_r, phi = math.pi * u[0] - math.pi / 2, math.pi * u[1]
     direction = Direction.at(-theta_r, phi, theta_r)  # theta_diff = theta_r
