@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -120,22 +119,25 @@ class HairKernel:
             counts = sort(theta_r, n, v, None)
             if counts is not None:
                 need = next((name for name in NEEDS[1:] if len(v) and counts[name] == len(v)), "both")
-                return self._prepared(Contexts(theta_r, n, v, theta_r.new_empty(0), self._sphere, need))
+                return self._prepared(theta_r, n, v, need)
         return self.prepare_context(self._context(theta_r, n, v))
 
     def prepare_context(self, context: Context) -> Contexts:
         """`prepare` for a `Context` of batch shape `[B]`."""
-        return self._prepared(self.bare_contexts(context))
+        bare = self.bare_contexts(context)
+        return self._prepared(bare.theta_r, bare.n, bare.v, bare.need)
 
     def _context(self, theta_r: Any, n: Any, v: Any) -> Context:
         given = (None if x is None else as_real("context", x, torch.float32) for x in (theta_r, 0.0, n, v))
         return Context(*given).reshape(-1)
 
-    def _prepared(self, bare: Contexts) -> Contexts:
-        program, given = self.program(bare.need), (bare.theta_r, bare.n, bare.v)
-        prepare = self._shaped if program.start is None else program.run.prepare
-        fields = prepare(program if program.start is None else program.start, *given)
-        return dataclasses.replace(bare, fields=fields)
+    def _prepared(self, theta_r: Tensor, n: Tensor, v: Tensor, need: str) -> Contexts:
+        program = self.program(need)
+        if program.start is None:
+            fields = self._shaped(program, theta_r, n, v)
+        else:
+            fields = program.run.prepare(program.start, theta_r, n, v)
+        return Contexts(theta_r, n, v, fields, self._sphere, need)
 
     @torch.no_grad()
     def _shaped(self, program: Program, theta_r: Tensor, n: Tensor, v: Tensor) -> Tensor:

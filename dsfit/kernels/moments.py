@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 from dataclasses import dataclass
 
@@ -17,12 +18,25 @@ from dsfit.proposals.parameters import STD_BOUNDS
 _NEAR, _FAR, _EIGHT = 16, 32, 8
 
 
+class Pointers(ctypes.Structure):
+    """`Start` of prepare.cpp."""
+
+    _fields_ = [(name, ctypes.c_void_p) for name in ("direct", "scattered", "depths", "network", "sizes")]
+    _fields_ += [(name, ctypes.c_int32) for name in ("layers", "widest", "rows", "levels")]
+    _fields_ += [(name, ctypes.c_float) for name in ("log_share", "low", "high")]
+
+
 @dataclass(frozen=True)
 class Start:
-    """Tensors that stay alive as long as `arguments`, which point to them in the order of `Start` in prepare.cpp."""
+    """What compiled code is pointed to, and the tensors there, which live as long."""
 
     tensors: tuple[Tensor, ...]
-    arguments: tuple
+    pointers: Pointers
+
+    @property
+    def address(self) -> int:
+        """Of the pointers."""
+        return ctypes.addressof(self.pointers)
 
 
 def is_served(proposal: AmortisedProposal) -> bool:
@@ -52,4 +66,4 @@ def packed(proposal: AmortisedProposal, components: list[int]) -> Start:
     tensors = (*floats, torch.tensor(sizes, dtype=torch.int32))
     numbers = len(layers), max(-(-size // _EIGHT) * _EIGHT for size in sizes), *scattered.shape[:2]
     share = math.log1p(-proposal.defensive)
-    return Start(tensors, (*(x.data_ptr() for x in tensors), *numbers, share, *STD_BOUNDS))
+    return Start(tensors, Pointers(*(x.data_ptr() for x in tensors), *numbers, share, *STD_BOUNDS))

@@ -30,11 +30,6 @@ def _pointers(*names: str) -> dict[str, type]:
 
 _Tables = _structure(**_pointers("constants", "records", "averages", "density", "cumulative", "guide"))
 _Context = _structure(**_pointers("theta_r", "n", "v", "fields"), count=c_int64, sphere=c_float)
-_Start = _structure(
-    **_pointers("direct", "scattered", "depths", "network", "sizes"),
-    **dict.fromkeys(("layers", "widest", "rows", "levels"), c_int32),
-    **dict.fromkeys(("log_share", "low", "high"), c_float),
-)
 _Shading = _structure(
     **_pointers("theta_r", "n", "v", "u", "theta_i", "phi", "pdf", "value"),
     samples=c_int64,
@@ -152,20 +147,20 @@ def native_functions(layout: Layout) -> Functions:
 
     def prepare(start: Start, theta_r: Tensor, n: Tensor, v: Tensor) -> Tensor:
         out = theta_r.new_empty(len(FIELDS), len(layout.components), len(theta_r))
-        s = _Start(*start.arguments)
-        arguments = *tables(theta_r, n, v), len(theta_r), out.data_ptr()
-        code.dsfit_prepare(ctypes.addressof(s), *arguments)
+        context = theta_r.data_ptr(), n.data_ptr(), v.data_ptr()
+        code.dsfit_prepare(start.address, *context, len(theta_r), out.data_ptr())
         return out
 
     def sort(theta_r: Tensor, n: Tensor, v: Tensor, index: Tensor | None) -> dict[str, int] | None:
         counts = (c_int64 * 3)()
-        pointers = tables(theta_r, n, v), tables(index)
-        valid = code.dsfit_sort(*pointers[0], len(theta_r), *pointers[1], ctypes.addressof(counts))
+        context = theta_r.data_ptr(), n.data_ptr(), v.data_ptr()
+        where = None if index is None else index.data_ptr()
+        valid = code.dsfit_sort(*context, len(theta_r), where, ctypes.addressof(counts))
         return dict(zip(NEEDS, counts, strict=True)) if valid else None
 
     def shade(t, start, context, sphere, u, index, count, out):  # noqa: ANN001, ANN202
         r = _Shading(*tables(*context, u, *out), *u.shape[:2], sphere)
-        t, s = _Tables(*tables(t.constants, t.records, t.averages, *t.laws)), _Start(*start.arguments)
-        code.dsfit_shade(*(ctypes.addressof(x) for x in (t, s, r)), index.data_ptr(), count)
+        t = _Tables(*tables(t.constants, t.records, t.averages, *t.laws))
+        code.dsfit_shade(ctypes.addressof(t), start.address, ctypes.addressof(r), index.data_ptr(), count)
 
     return Functions(evaluated, log_prob, sample, sample_eval, fields, prepare, sort, shade)

@@ -257,14 +257,17 @@ void dsfit_prepare(const Start* s, const float* theta_r, const float* n, const f
 // [3, count]; false where one is not valid
 int32_t dsfit_sort(const float* theta_r, const float* n, const float* v, int64_t count, int32_t* index,
                    int64_t* counts) {
-    int64_t found[3] = {0, 0, 0};
+    int64_t found[3] = {0, 0, 0};  // without branches, which would be mispredicted
     int32_t valid = 1;
     for (int64_t b = 0; b < count; b++) {
-        valid &= __builtin_fabsf(theta_r[b]) <= 1.57079637f && n[b] >= 0 && n[b] < __builtin_inff() && v[b] >= 0 &&
-                 v[b] <= 1;
-        int kind = v[b] == 1 ? 1 : v[b] == 0 ? 2 : 0;
-        if (index) index[kind * count + found[kind]] = (int32_t)b;
-        found[kind]++;
+        valid &= (__builtin_fabsf(theta_r[b]) <= 1.57079637f) & (n[b] >= 0) & (n[b] < __builtin_inff());
+        valid &= (v[b] >= 0) & (v[b] <= 1);
+        int lit = v[b] == 1, unlit = v[b] == 0;
+        if (index)
+            for (int k = 0; k < 3; k++) index[k * count + found[k]] = (int32_t)b;
+        found[0] += !(lit | unlit);
+        found[1] += lit;
+        found[2] += unlit;
     }
     std::memcpy(counts, found, sizeof found);
     return valid;

@@ -16,9 +16,10 @@ if TYPE_CHECKING:
 
 def are_plain(*given: object) -> bool:
     """Whether all are contiguous float32 tensors `[B]` that compiled code can read as they are."""
-    if not all(isinstance(x, Tensor) and x.dtype == torch.float32 and x.ndim == 1 for x in given):
-        return False
-    return all(x.device.type == "cpu" and x.is_contiguous() and len(x) == len(given[0]) for x in given)
+    for x in given:
+        if not (isinstance(x, Tensor) and x.dtype is torch.float32 and x.ndim == 1 and x.is_cpu and x.is_contiguous()):
+            return False
+    return all(x.shape == given[0].shape for x in given)
 
 
 def check_uniforms(u: Tensor, batch: int) -> None:

@@ -23,14 +23,9 @@ INLINE V number(I x) { return __builtin_convertvector(x, V); }
 INLINE I whole(V x) { return __builtin_convertvector(x, I); }
 INLINE I imin(I a, I b) { return a < b ? a : b; }
 
-// x * x - square exactly
-INLINE V fused_rest(V x, V square) {
-    V r;
-    for (int l = 0; l < W; l++) r[l] = __builtin_fmaf(x[l], x[l], -square[l]);
-    return r;
-}
-
+// fused_rest: x * x - square exactly
 #if defined(__AVX512F__)
+INLINE V fused_rest(V x, V square) { return (V)_mm512_fmsub_ps((__m512)x, (__m512)x, (__m512)square); }
 INLINE V root(V x) { return (V)_mm512_sqrt_ps((__m512)x); }
 INLINE V take(const float* p, I i) { return (V)_mm512_i32gather_ps((__m512i)i, p, 4); }
 INLINE void put(float* p, I i, V x) { _mm512_i32scatter_ps(p, (__m512i)i, (__m512)x, 4); }
@@ -45,6 +40,11 @@ INLINE V inverse(V x) {
     return y * (2.0f - x * y);
 }
 #else
+INLINE V fused_rest(V x, V square) {
+    V r;
+    for (int l = 0; l < W; l++) r[l] = __builtin_fmaf(x[l], x[l], -square[l]);
+    return r;
+}
 INLINE V root(V x) { V r; for (int l = 0; l < W; l++) r[l] = __builtin_sqrtf(x[l]); return r; }
 INLINE V take(const float* p, I i) { V r; for (int l = 0; l < W; l++) r[l] = p[i[l]]; return r; }
 INLINE void put(float* p, I i, V x) { for (int l = 0; l < W; l++) p[i[l]] = x[l]; }
