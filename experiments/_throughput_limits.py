@@ -45,7 +45,7 @@ def _lines(kernel: Any, task: str) -> int:
     rows of averages; what a bisection in a table of azimuths reads comes on top of that."""
     if task in ("prepare", "sample"):
         return 0
-    layout = kernel._program("both").layout
+    layout = kernel.program("both").layout
     averages = 0 if task == "log_prob" else -(-5 * layout.channels // LINE)
     return 4 * (layout.width // LINE) + 2 * averages
 

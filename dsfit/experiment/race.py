@@ -16,6 +16,7 @@ from torch import Tensor
 from dsfit.context import Context
 from dsfit.errors import InputError
 from dsfit.experiment import build, files
+from dsfit.experiment.race_summary import heavy_tailed
 from dsfit.experiment.rundir import RunDirectory
 from dsfit.experiment.schema import Config
 from dsfit.experiment.schema_race import RacePeer
@@ -233,9 +234,13 @@ def _contexts(course: Course, ready: Ready, generator: torch.Generator) -> dict[
 
 
 def _verdict(found: dict[str, Any]) -> dict[str, Any]:
-    """Whether any point of the cell is off the truth: "biased", "unbiased", or "untested"."""
+    """Whether any point of the cell is off the truth: "biased", "unbiased", or "untested".
+
+    Where rare large weights decide, means of finitely many estimates are nearly always too small and a t-test says
+    nothing: such rows count as untested, and the peer is marked for its tails instead.
+    """
     rows = [found["stream"]] if "stream" in found else found["contexts"]
-    tested = [point["p_value"] for row in rows for point in row["points"] if point["tested"]]
+    tested = [p["p_value"] for row in rows if not heavy_tailed(row) for p in row["points"] if p["tested"]]
     if not tested:
         return {"verdict": "untested", "p_value": 1.0}
     p = -math.expm1(len(tested) * math.log1p(-min(min(tested), 1 - 1e-16)))

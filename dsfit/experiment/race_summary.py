@@ -40,7 +40,7 @@ class Entrant:
         """Whether its errors are understated: one estimate decides the last root mean square, or quadrature says that
         it is far larger than measured."""
         rows = [*([self.stream] if self.stream else []), *(self.contexts or [])]
-        return any(_heavy(row) for row in rows)
+        return any(heavy_tailed(row) for row in rows)
 
     @property
     def honest(self) -> bool:
@@ -48,7 +48,8 @@ class Entrant:
         return not self.biased and not self.heavy and self.skipped is None
 
 
-def _heavy(row: dict[str, Any]) -> bool:
+def heavy_tailed(row: dict[str, Any]) -> bool:
+    """Whether the errors of a stream or a context are understated; see `Entrant.heavy`."""
     last = row["points"][-1]
     predicted = math.sqrt(max(number(row.get("predicted_variance", math.nan)), 0.0) / last["samples"])
     return bool(last["rmse"]["heavy"]) or predicted > UNDERSTATED * number(last["rmse"]["high"])

@@ -284,3 +284,9 @@ def test_names_beside_curves_keep_their_distance_and_stay_inside() -> None:
     places = _spread_out([0.0, 0.01, 0.02, 0.99, 1.0], 0.2, 0.0, 1.0)
     assert all(b - a > 0.199 for a, b in zip(places, places[1:], strict=False))
     assert places[0] >= -1e-9 and places[-1] <= 1 + 1e-9
+
+
+@pytest.mark.parametrize(("heavy", "verdict"), [(False, "biased"), (True, "untested")])
+def test_heavy_tails_are_not_taken_for_a_bias(heavy: bool, verdict: str) -> None:
+    point = {"samples": 64, "tested": True, "p_value": 1e-9, "rmse": {"heavy": heavy, "high": 0.1}}
+    assert race._verdict({"stream": {"points": [point]}})["verdict"] == verdict
