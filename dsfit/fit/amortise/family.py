@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,13 +10,14 @@ from dataclasses import dataclass, field
 import torch
 
 from dsfit.errors import InputError, as_number
+from dsfit.fit.amortise.descent import Progress, descend
 from dsfit.fit.amortise.family_targets import FamilyTargets, family_targets
-from dsfit.fit.amortise.train import TRAINING, Progress
+from dsfit.fit.amortise.train import TRAINING
 from dsfit.proposals.family import FamilyProposal
 from dsfit.streams import ContextStream
 
 FIBERS, STEPS = 256, 3000
-_RATE, _WARM = 5e-3, 30
+_RATE = 5e-3
 _BATCH, _AT_ONCE = 32, 64
 
 
@@ -89,7 +89,16 @@ def train_family(
         drawn = proposal.family.draw(fibers, generator)
         targets = family_targets(proposal, drawn, stream, inclinations, pairs, generator, progress=progress)
     began = time.perf_counter()
-    history = _train(proposal, targets, scale, steps, generator)
+    _, history = descend(
+        proposal.parameters(),
+        lambda rows: torch.log1p(targets[rows].excess(proposal.network, proposal.defensive) / scale).mean(),
+        len(targets),
+        generator,
+        rate=_RATE,
+        batch=_BATCH,
+        steps=steps,
+        every=50,
+    )
     spent = {"targets": targets.seconds, "training": time.perf_counter() - began}
     excess = torch.sort(family_excess(proposal, targets).flatten()).values.tolist()
     proposal.requires_grad_(False)
@@ -101,33 +110,6 @@ def family_excess(proposal: FamilyProposal, targets: FamilyTargets) -> torch.Ten
     """Excess of the family's proposals at the contexts of the targets, by their quadrature, `[views, M]`."""
     rows = range(0, len(targets), _AT_ONCE)
     return torch.cat([targets[i : i + _AT_ONCE].excess(proposal.network, proposal.defensive) for i in rows])
-
-
-def _train(
-    proposal: FamilyProposal, targets: FamilyTargets, scale: float, steps: int, generator: torch.Generator
-) -> list[Progress]:
-    optimiser = torch.optim.Adam(proposal.parameters(), lr=_RATE)
-    began, recent = time.perf_counter(), []
-    history: list[Progress] = []
-    order = torch.randperm(len(targets), generator=generator)
-    batch = min(_BATCH, len(targets))
-    for step in range(steps):
-        rate = _RATE * 0.5 * (1 + math.cos(math.pi * step / steps)) * min(1.0, (step + 1) / _WARM)
-        for group in optimiser.param_groups:
-            group["lr"] = rate
-        if len(order) < batch:
-            order = torch.randperm(len(targets), generator=generator)
-        rows, order = order[:batch], order[batch:]
-        objective = torch.log1p(targets[rows].excess(proposal.network, proposal.defensive) / scale).mean()
-        optimiser.zero_grad()
-        objective.backward()
-        torch.nn.utils.clip_grad_norm_(proposal.parameters(), 1.0)
-        optimiser.step()
-        recent.append(float(objective.detach()))
-        if (step + 1) % 50 == 0 or step + 1 == steps:
-            history.append(Progress(step + 1, time.perf_counter() - began, sum(recent) / len(recent)))
-            recent = []
-    return history
 
 
 __all__ = ["FIBERS", "STEPS", "TrainedFamily", "family_excess", "train_family"]

@@ -12,25 +12,17 @@ import torch
 from dsfit.bsdf.dual_scattering import DualScattering
 from dsfit.context import Context
 from dsfit.errors import InputError, as_number
+from dsfit.fit.amortise.descent import Progress, descend
 from dsfit.fit.amortise.excess import all_excesses, excess_at
-from dsfit.fit.amortise.targets import Targets, make_targets
+from dsfit.fit.amortise.targets import make_targets
 from dsfit.proposals.amortised import AmortisedProposal, fiber_numbers
 from dsfit.streams import ContextStream
 
 TRAINING = ContextStream(theta="angle", theta_max=math.radians(89.8), rule="mixed", direct=0.2, n_mean=15.0)
 """Uniform in theta_r and nearly so in n to 30, v of every kind: what a renderer may meet, and a little beyond."""
 STEPS = 2400
-_RATE, _LAST_RATE, _WARM = 7e-3, 1e-5, 30
+_RATE, _LAST_RATE = 7e-3, 1e-5
 _BATCH = 12
-
-
-@dataclass(frozen=True)
-class Progress:
-    """After so many steps and seconds of training: the objective, mean over the steps since the last entry."""
-
-    step: int
-    seconds: float
-    objective: float
 
 
 @dataclass(frozen=True)
@@ -109,7 +101,18 @@ def amortise(
     generator = torch.Generator().manual_seed(seed)
     targets = make_targets(bsdf, proposal, training_contexts(stream, inclinations, pairs, generator))
     ready = time.perf_counter()
-    done, history = _train(proposal, targets, scale, steps, limit, generator)
+    done, history = descend(
+        proposal.parameters(),
+        lambda rows: torch.log1p(excess_at(targets[rows], proposal) / scale).mean(),
+        len(targets),
+        generator,
+        rate=_RATE,
+        last_rate=_LAST_RATE,
+        batch=_BATCH,
+        steps=steps,
+        limit=limit,
+        every=20,
+    )
     ended = time.perf_counter()
     spent = {"proposal": made - began, "targets": ready - made, "training": ended - ready, "total": ended - began}
     excess = torch.sort(all_excesses(targets, proposal).flatten()).values.tolist()
@@ -145,40 +148,3 @@ def training_contexts(stream: ContextStream, inclinations: int, pairs: int, gene
     order = torch.randperm(inclinations * pairs, generator=generator)
     n, v = (x[order].reshape(inclinations, pairs) for x in (other.n, other.v))
     return Context(theta_r[:, None], 0.0, n, v)
-
-
-@torch.enable_grad()
-def _train(
-    proposal: AmortisedProposal,
-    targets: Targets,
-    scale: float,
-    steps: int | None,
-    limit: float,
-    generator: torch.Generator,
-) -> tuple[int, list[Progress]]:
-    optimiser = torch.optim.Adam(proposal.parameters(), lr=_RATE)
-    began, done, recent = time.perf_counter(), 0, []
-    history: list[Progress] = []
-    order = torch.randperm(len(targets), generator=generator)
-    while True:
-        spent = time.perf_counter() - began
-        share = spent / limit if steps is None else done / steps if steps else 1.0
-        if share >= 1:
-            break
-        rate = _LAST_RATE + _RATE * 0.5 * (1 + math.cos(math.pi * share)) * min(1.0, (done + 1) / _WARM)
-        for group in optimiser.param_groups:
-            group["lr"] = rate
-        if len(order) < min(_BATCH, len(targets)):
-            order = torch.randperm(len(targets), generator=generator)
-        rows, order = order[:_BATCH], order[_BATCH:]
-        objective = torch.log1p(excess_at(targets[rows], proposal) / scale).mean()
-        optimiser.zero_grad()
-        objective.backward()
-        torch.nn.utils.clip_grad_norm_(proposal.parameters(), 1.0)
-        optimiser.step()
-        done += 1
-        recent.append(float(objective.detach()))
-        if done % 20 == 0 or done == steps:
-            history.append(Progress(done, time.perf_counter() - began, sum(recent) / len(recent)))
-            recent = []
-    return done, history
