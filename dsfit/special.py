@@ -315,3 +315,9 @@ def _wrapped_waves(x: Tensor, std: Tensor) -> Tensor:
     for k in (2, 3, 4):
         waves = waves + torch.exp(-0.5 * (k * std) ** 2) * torch.cos(k * x)
     return torch.log1p(2 * waves) - math.log(TWO_PI)
+
+
+def log_share(share: Tensor) -> Tensor:
+    """log of a share in [0, 1], -inf (with zero gradient) where it is 0."""
+    zero = share <= 0
+    return torch.log(torch.where(zero, 1.0, share)).masked_fill(zero, -math.inf)

@@ -21,6 +21,7 @@ from dsfit.proposals.parameters import STD_BOUNDS
 from dsfit.proposals.split_lobe import SplitGaussianInclination
 from dsfit.proposals.structured import azimuth_tables
 from dsfit.proposals.uniform import BackHalf, UniformAzimuth, UniformSphere
+from dsfit.special import log_share
 
 _SHIFT, _STRETCH = 4.0, 3.0
 
@@ -142,7 +143,7 @@ def _features(context: Context, near: Tensor, far: Tensor) -> Tensor:
     theta_r, n, v = context.theta_r, context.n, context.v
     energy = far[..., 0, :]
     ratio = torch.logsumexp(near[..., 0, :], dim=-1) - torch.logsumexp(energy, dim=-1)
-    lit = ratio + _log_share(v) - _log_share(1 - v)
+    lit = ratio + log_share(v) - log_share(1 - v)
     columns = [
         theta_r / HALF_PI,
         torch.sin(2 * theta_r),
@@ -169,10 +170,5 @@ def _together(near: Tensor, far: Tensor) -> Tensor:
 
 def _shared(moments: Tensor, share: Tensor) -> Tensor:
     """Moments `[*batch, 4, k]` of a share of the light."""
-    energy = moments[..., :1, :] + _log_share(share)[..., None, None]
+    energy = moments[..., :1, :] + log_share(share)[..., None, None]
     return torch.cat([energy, moments[..., 1:, :]], dim=-2)
-
-
-def _log_share(share: Tensor) -> Tensor:
-    zero = share <= 0
-    return torch.log(torch.where(zero, 1.0, share)).masked_fill(zero, -math.inf)

@@ -13,6 +13,7 @@ from dsfit.bsdf.dual_scattering import DualScattering
 from dsfit.context import Context
 from dsfit.errors import InputError
 from dsfit.frame import HALF_PI, cos_inclination
+from dsfit.special import log_share
 
 FAMILIES = ("R", "TT", "TRT", "R_scattered", "TT_scattered", "TRT_scattered", "back")
 _TINY = 1e-30
@@ -103,9 +104,3 @@ class ContextLobes(nn.Module):
 def log_norm(log_value: Tensor) -> Tensor:
     """log of the Euclidean norm over channels of exp(log_value)."""
     return 0.5 * torch.logsumexp(2 * log_value, dim=-1)
-
-
-def log_share(share: Tensor) -> Tensor:
-    """log, -inf where the share is 0."""
-    zero = share <= 0
-    return torch.log(torch.where(zero, 1.0, share)).masked_fill(zero, -math.inf)
