@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -73,9 +73,9 @@ class Context:
 
     def _map(self, function: Any) -> Context:
         """The context with a function that changes no number applied to every field; so nothing is checked again."""
-        result = object.__new__(Context)
-        for name in ("theta_r", "phi_r", "n", "v"):
-            object.__setattr__(result, name, function(getattr(self, name)))
+        result = object.__new__(type(self))
+        for field in fields(self):
+            object.__setattr__(result, field.name, function(getattr(self, field.name)))
         return result
 
     def to(self, *args: Any, **kwargs: Any) -> Context:

@@ -81,6 +81,13 @@ class Light(nn.Module, ABC):
         other._buffers["rotation"] = check_rotation(rotation)
         return other
 
+    def placed(self, position: Tensor, rotation: Tensor) -> Light:
+        """The light as points `[*batch, 3]` of the world with fibre frames `[*batch, 3, 3]` see it.
+
+        Lights at infinity look the same from everywhere, so only their rotation matters; lights nearby override this.
+        """
+        return self.rotated(rotation)
+
     def world_vector(self, omega_i: Tensor) -> Tensor:
         """Unit vectors `[..., 3]` in the frame of the light's description."""
         vector = to_vector(omega_i)
