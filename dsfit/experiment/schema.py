@@ -10,6 +10,14 @@ from dsfit.experiment.check_schema import CheckConfig
 from dsfit.experiment.schema_amortise import AmortiseConfig, AmortisedMethod
 from dsfit.experiment.schema_plan import PlanConfig
 from dsfit.experiment.schema_race import RaceConfig
+from dsfit.experiment.schema_render import (
+    CameraConfig,
+    CompareConfig,
+    GeneratorGeometry,
+    GeometryConfig,
+    GridConfig,
+    RenderConfig,
+)
 from dsfit.experiment.sections import Section
 
 SCHEMA_VERSION = 1
@@ -233,11 +241,14 @@ class TransmittanceConfig(Section):
     n: Annotated[list[Annotated[int, Field(ge=1, le=10_000)]], Field(min_length=1)] = list(range(1, 51))
 
 
+Kind = Literal["compare", "sweep", "transmittance", "check", "race", "amortise", "render", "compare_render"]
+
+
 class Config(Section):
     """A whole experiment."""
 
     title: Annotated[str, Field(max_length=200)] = ""
-    kind: Literal["compare", "sweep", "transmittance", "check", "race", "amortise"] = "compare"
+    kind: Kind = "compare"
     fiber: FiberConfig = FiberConfig()
     bsdf: BsdfConfig = BsdfConfig()
     light: LightConfig = ConstantLight()
@@ -252,3 +263,8 @@ class Config(Section):
     check: CheckConfig = CheckConfig()
     race: RaceConfig = RaceConfig()
     amortise: AmortiseConfig = AmortiseConfig()
+    geometry: GeometryConfig = GeneratorGeometry()
+    camera: CameraConfig = CameraConfig()
+    grid: GridConfig = GridConfig()
+    render: RenderConfig = RenderConfig()
+    compare: CompareConfig = CompareConfig()

@@ -68,8 +68,9 @@ def _anchor_paths(raw: RawConfig) -> None:
         source = Path(raw.source(key))
         return str(((source.parent if source.is_file() else Path()) / path).resolve())
 
-    if raw.lookup(("light", "path")) is not None:
-        raw.data["light"]["path"] = anchored(("light", "path"), raw.lookup(("light", "path")))
+    for section in ("light", "geometry"):
+        if raw.lookup((section, "path")) is not None:
+            raw.data[section]["path"] = anchored((section, "path"), raw.lookup((section, "path")))
     methods = raw.lookup(("methods",))
     for k, method in enumerate(methods if isinstance(methods, list) else []):
         if isinstance(method, dict) and "file" in method:
