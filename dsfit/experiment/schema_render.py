@@ -44,7 +44,31 @@ class Translate(Section):
     by: Vector
 
 
-Transform = Annotated[Scale | Rotate | Translate, Field(discriminator="kind")]
+class TurnUp(Section):
+    """From a world in which the axis `up` points up."""
+
+    kind: Literal["turn_up"]
+    up: Literal["x", "y", "z", "-x", "-y", "-z"]
+
+
+class FitInto(Section):
+    """Scaled and moved so that their box just fits into a cube of this side, or a box of these sides, centred at the
+    origin."""
+
+    kind: Literal["fit_into"]
+    size: Positive | Annotated[list[Positive], Field(min_length=3, max_length=3)]
+
+
+class Thin(Section):
+    """Every k-th strand; `keep` is what the change of radius keeps: the expected scatter counts, the volume, or the
+    radius itself."""
+
+    kind: Literal["thin"]
+    every: Annotated[int, Field(ge=1)]
+    keep: Literal["counts", "volume", "radius"] = "counts"
+
+
+Transform = Annotated[Scale | Rotate | Translate | TurnUp | FitInto | Thin, Field(discriminator="kind")]
 
 
 class Placed(Section):
@@ -80,13 +104,15 @@ GeometryConfig = Annotated[GeneratorGeometry | HairFile | PbrtFile, Field(discri
 
 
 class CameraConfig(Section):
-    """`[camera]`: a pinhole; `fov_deg` is the vertical angle of view. What is left out is taken from the geometry's
-    suggested view."""
+    """`[camera]`: a pinhole; `fov_deg` is the vertical angle of view. Without a `position`, it stands in `direction`
+    from the strands, `margin` times as far away as it takes to see all of them in a square picture."""
 
     position: Vector | None = None
+    direction: Vector = [0.35, 0.25, 1.0]
+    margin: Annotated[float, Field(ge=0.05, le=100)] = 1.0
     target: Vector | None = None
-    up: Vector | None = None
-    fov_deg: Annotated[float, Field(gt=0, lt=180)] | None = None
+    up: Vector = [0.0, 1.0, 0.0]
+    fov_deg: Annotated[float, Field(gt=1, lt=150)] = 30.0
     width: Pixels = 512
     height: Pixels = 512
 
