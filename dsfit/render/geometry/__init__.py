@@ -1,0 +1,49 @@
+"""Hair to render: generators, readers of files, transformations, where to look from.
+
+Generators take a `seed` and sizes in centimetres and return float64 `Strands`, y up, roots first. `GENERATORS` maps
+their names to them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from dsfit.render.geometry.ball import ball
+from dsfit.render.geometry.block import block
+from dsfit.render.geometry.double_block import double_block
+from dsfit.render.geometry.transform import (
+    fitted_into,
+    joined,
+    scaled,
+    subsampled,
+    translated,
+    turned_up,
+    with_radius,
+)
+from dsfit.render.geometry.view import suggested_view
+from dsfit.render.geometry.wavy_bundle import wavy_bundle
+from dsfit.render.strands import Strands
+
+GENERATORS: dict[str, Callable[..., Strands]] = {
+    "block": block,
+    "double_block": double_block,
+    "wavy_bundle": wavy_bundle,
+    "ball": ball,
+}
+"""Generators of strands by name."""
+
+__all__ = [
+    "GENERATORS",
+    "ball",
+    "block",
+    "double_block",
+    "fitted_into",
+    "joined",
+    "scaled",
+    "subsampled",
+    "suggested_view",
+    "translated",
+    "turned_up",
+    "wavy_bundle",
+    "with_radius",
+]
