@@ -185,3 +185,7 @@ def check(raw: RawConfig, config: Config) -> None:
         from dsfit.experiment.amortise import check as check_amortise
 
         check_amortise(raw, config)
+    if config.kind in ("render", "compare_render"):
+        from dsfit.experiment.render_scene import check as check_scene
+
+        check_scene(raw, config)

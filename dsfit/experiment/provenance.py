@@ -43,8 +43,9 @@ def run_id(config: Config) -> str:
     """Hash of everything that decides the numbers: the resolved config without where it is written, files it reads,
     and the code."""
     data = config.model_dump(exclude={"output", "title"})
-    if path := data["light"].get("path"):
-        data["light"]["path"] = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    for part in (data["light"], *data["light"].get("lights", []), data["geometry"]):
+        if path := part.get("path"):
+            part["path"] = hashlib.sha256(Path(path).read_bytes()).hexdigest()
     if config.kind == "check":
         from dsfit.experiment.checking import files_of
 

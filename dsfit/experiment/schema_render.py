@@ -141,7 +141,8 @@ class RenderConfig(Section):
 
     Every pixel has `subsamples` camera rays; the hits get `passes` times `samples` directions, in independent passes,
     whose spread gives the variance. Tiles of `tile` x `tile` pixels are computed and stored one by one. `v` is the rule
-    for the directly lit share. `exposure` is in stops and, as `tone_map`, matters to the PNG alone.
+    for the directly lit share. `exposure` is a factor on the radiance (left out: one that suits the image) and, as
+    `tone_map`, matters to the PNG alone.
     """
 
     subsamples: Annotated[int, Field(ge=1, le=1024)] = 16
@@ -153,7 +154,7 @@ class RenderConfig(Section):
     seed: Seed = 1
     dtype: Literal["float32", "float64"] = "float32"
     background: Channels = 0.0
-    exposure: float = 0.0
+    exposure: Positive | None = None
     tone_map: Literal["srgb", "filmic"] = "filmic"
 
 
@@ -181,8 +182,9 @@ class CompareConfig(Section):
 
     The image is `width` pixels wide, its height follows from the camera's shape, and every pixel has `subsamples` rays.
     Samples per hit double from `first` until a technique has used up its `seconds` (CPU seconds of one thread, all
-    rungs together) or has reached `most`. Pictures are shown at `equal_seconds` and at `equal_samples`; `crop` is their
-    part of the image that is shown large: left, top, right, bottom as shares of its sides.
+    rungs together) or has reached `most`. `targets` are relative errors (root of the relative mean square) whose times
+    are compared. Pictures are shown at `equal_seconds` and at `equal_samples`; `crop` is their part of the image that
+    is shown large: left, top, right, bottom as shares of its sides.
     """
 
     width: Pixels = 160
@@ -190,6 +192,7 @@ class CompareConfig(Section):
     first: Samples = 1
     most: Samples = 4096
     seconds: Seconds = 16.0
+    targets: Annotated[list[Annotated[float, Field(gt=0, le=1)]], Field(min_length=1, max_length=4)] = [0.05, 0.02]
     equal_seconds: Seconds = 2.0
     equal_samples: Samples = 16
     crop: Annotated[list[Annotated[float, Field(ge=0, le=1)]], Field(min_length=4, max_length=4)] = [0.3, 0.3, 0.7, 0.7]

@@ -1,0 +1,89 @@
+"""What a ladder of sample counts says: slope, time to an error, and ratios of such times."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from dsfit.race.curve import Curve
+
+T = TypeVar("T")
+_LAST = 5
+_CLEAR = 1.5
+
+
+@dataclass(frozen=True)
+class Time:
+    """Seconds to an error. `how`: "measured" (between rungs), "extrapolated" (beyond the last by 1/t: random points),
+    "at most" (the first rung is better already), "more" (Sobol points that have not reached it; the seconds are those
+    of the last rung), "never" (an error that is not finite)."""
+
+    seconds: float
+    how: str
+
+
+def climb(
+    measure: Callable[[int], tuple[T, float]], first: int, most: int, budget: float
+) -> list[tuple[int, float, T]]:
+    """Measure with `first`, twice, four times ... as many samples, until the next rung would not fit into the budget of
+    seconds or has more than `most` samples; at least one rung.
+
+    Args:
+        measure: takes samples, returns a result and the seconds it took.
+    """
+    rungs: list[tuple[int, float, T]] = []
+    samples, spent = first, 0.0
+    while True:
+        result, seconds = measure(samples)
+        rungs.append((samples, seconds, result))
+        spent, samples = spent + seconds, 2 * samples
+        if samples > most or spent + 2 * seconds > budget:
+            return rungs
+
+
+def slope(seconds: Sequence[float], errors: Sequence[float], floor: float = 0.0) -> float:
+    """Exponent a of error ~ t^a (root mean squares; -1/2 for random points) over the last rungs, by least squares in
+    logarithms; rungs whose error is not well above `floor`, the reference's own, are left out. nan for fewer than
+    three rungs."""
+    good = [(t, e) for t, e in zip(seconds, errors, strict=True) if t > 0 and math.isfinite(e) and e > _CLEAR * floor]
+    good = [(t, e) for t, e in good if e > 0][-_LAST:]
+    if len(good) < 3:
+        return math.nan
+    t, e = np.log(np.array(good)).T
+    return float(np.polyfit(t, e, 1)[0])
+
+
+def time_to(
+    error: float, seconds: Sequence[float], errors: Sequence[float], uniforms: str, before: float = 0.0
+) -> Time:
+    """When the root mean square error is reached; see `Time`.
+
+    Args:
+        seconds, errors: of the rungs.
+        uniforms: "random" or "sobol".
+        before: seconds of preparation that count.
+    """
+    found = Curve(before, seconds, errors).time_to(error)
+    if found.how == "extrapolated" and uniforms != "random":
+        return Time(before + max(seconds), "more")
+    return Time(found.value, found.how)
+
+
+def ratio(slow: Time, fast: Time) -> Time:
+    """How many times as long `slow` takes, with the weaker of the two `how`s: "more" where it is at least that,
+    "at most", "extrapolated"; "unknown" where the bounds point in different directions."""
+    hows = {slow.how, fast.how}
+    if "never" in hows or not fast.seconds > 0 or not math.isfinite(fast.seconds):
+        return Time(math.nan, "unknown")
+    value = slow.seconds / fast.seconds
+    up = slow.how == "more" or fast.how == "at most"
+    down = slow.how == "at most" or fast.how == "more"
+    if up and down:
+        return Time(math.nan, "unknown")
+    if up or down:
+        return Time(value, "more" if up else "at most")
+    return Time(value, "extrapolated" if "extrapolated" in hows else "measured")
