@@ -130,7 +130,7 @@ def camera_of(config: Config, strands: Strands) -> Camera:
         position = target + (seen - middle) * c.margin
     elif target is None:
         target = (strands.bounds[0] + strands.bounds[1]) / 2
-    return Camera(position, target, c.up, c.fov_deg, c.width, c.height)
+    return Camera(position, target, c.up, fov_deg=c.fov_deg, width=c.width, height=c.height)
 
 
 def scene_of(config: Config) -> RenderScene:
