@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dsfit.render.hits import HitContext, Hits
+from dsfit.render.camera import Camera
+from dsfit.render.hits import HitContext, Hits, context_of, coverage_of
 from dsfit.render.strands import Strands
+from dsfit.render.visibility import Visibility
 
-__all__ = ["HitContext", "Hits", "Strands"]
+__all__ = ["Camera", "HitContext", "Hits", "Strands", "Visibility", "context_of", "coverage_of"]

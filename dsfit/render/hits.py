@@ -9,6 +9,10 @@ import torch
 from torch import Tensor
 
 from dsfit.context import Context
+from dsfit.errors import check_dtype
+from dsfit.frame import HALF_PI, to_angles
+
+_LIMIT = {dtype: torch.tensor(HALF_PI, dtype=dtype).item() for dtype in (torch.float64, torch.float32)}
 
 
 @dataclass(frozen=True)
@@ -65,3 +69,26 @@ class HitContext(Context):
     def to(self, *args: Any, **kwargs: Any) -> HitContext:
         plain = super().to(*args, **kwargs)
         return HitContext(plain.theta_r, plain.phi_r, plain.n, plain.v, hit=self.hit.to(plain.device))
+
+
+def context_of(hits: Hits, n: Any = 0.0, v: Any = None, dtype: torch.dtype = torch.float64) -> HitContext:
+    """The contexts `[H]` of hits: viewing directions in their fibre frames, computed in float64 and rounded at the end.
+
+    Args:
+        hits: what the camera sees.
+        n, v: scattering hints `[H]` or single numbers, as for `Context`.
+        dtype: of the contexts; theta_r is kept inside its range there.
+
+    Raises:
+        InputError: hints out of range or of another length, another dtype.
+    """
+    check_dtype("context.dtype", dtype)
+    viewer = (hits.frame.to(torch.float64) @ hits.outgoing.to(torch.float64).unsqueeze(-1)).squeeze(-1)
+    theta, phi = to_angles(viewer).to(dtype).unbind(-1)
+    theta = theta.clamp(-_LIMIT[dtype], _LIMIT[dtype])
+    return HitContext(theta, phi, n, v, hit=torch.arange(len(hits)), dtype=dtype)
+
+
+def coverage_of(hits: Hits, pixels: int, samples: int) -> Tensor:
+    """Share `[pixels]` (float64) of each pixel's rays that hit a fibre."""
+    return torch.bincount(hits.pixel, minlength=pixels).to(torch.float64) / samples
