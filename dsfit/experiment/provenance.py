@@ -29,14 +29,25 @@ def version() -> str:
         return "0+source"
 
 
+_SOURCES = (".py", ".cpp", ".h", ".hpp")
+
+
 @cache
-def code_version() -> str:
-    """Package version and a hash of all its sources: any change to the code makes another run."""
+def sources_hash(packages: tuple[str, ...] = ()) -> str:
+    """Hash of the sources of dsfit, or of these packages of it and the modules beside them."""
     root = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
-        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    return f"{version()}+{digest.hexdigest()[:12]}"
+    for path in sorted(path for path in root.rglob("*") if path.suffix in _SOURCES):
+        name = path.relative_to(root)
+        if packages and len(name.parts) > 1 and name.parts[0] not in packages:
+            continue
+        digest.update(name.as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:12]
+
+
+def code_version() -> str:
+    """Package version and a hash of all its sources: any change to the code makes another run."""
+    return f"{version()}+{sources_hash()}"
 
 
 def run_id(config: Config) -> str:
