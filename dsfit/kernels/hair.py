@@ -161,6 +161,18 @@ class HairKernel:
         return self._values(self.program(contexts.need).eval(contexts, theta_i, phi))
 
     @torch.no_grad()
+    def eval_each(self, theta_r: Tensor, n: Tensor, v: Tensor, theta_i: Tensor, phi: Tensor) -> Tensor:
+        """F cos(theta_i) `[N, C]` of N directions with a context each, all float32 `[N]`; nothing is checked.
+
+        For renderers, where n and v change with the direction.
+        """
+        if not len(theta_i):
+            return theta_i.new_zeros(0, self.channels)
+        each = (x.contiguous() for x in (theta_r, n, v))
+        contexts = Contexts(*each, theta_r.new_empty(0), self._sphere, need_of(v))
+        return self.eval(contexts, theta_i.unsqueeze(0), phi.unsqueeze(0))[0]
+
+    @torch.no_grad()
     def log_prob(self, contexts: Contexts, theta_i: Tensor, phi: Tensor) -> Tensor:
         """Log density per steradian `[S, B]`."""
         return self.program(contexts.need).log_prob(contexts, theta_i, phi)

@@ -32,16 +32,16 @@ def mis_sampler(
     sample, else the multi- or one-sample estimator; `optimal` by `dsfit.estimate`, which finds its control variates
     from the samples."""
     if isinstance(heuristic(rule), Optimal):
-        return _OptimalSampler(problem, proposals, fractions, contexts, rule, model)
+        return OptimalSampler(problem, proposals, fractions, contexts, rule, model)
     distributions = [proposal(contexts) for proposal in proposals]
     if model == "one" and rule == "balance":
         log_shares = torch.log(torch.tensor(fractions, dtype=contexts.dtype))
         return DensitySampler(problem, MixtureDistribution(distributions, log_shares), contexts)
-    kind = _OneSample if model == "one" else _MultiSample
+    kind = OneSample if model == "one" else MultiSample
     return kind(problem, distributions, fractions, contexts, rule)
 
 
-class _MultiSample(Sampler):
+class MultiSample(Sampler):
     """`sum_s 1/n_s sum_i w_s F / p_s` with counts in proportion to the shares, each at least 1."""
 
     def __init__(
@@ -64,7 +64,7 @@ class _MultiSample(Sampler):
         return torch.as_tensor(total) / samples
 
 
-class _OneSample(Sampler):
+class OneSample(Sampler):
     """`mean of w_s F / (c_s p_s)`, each sample's strategy chosen by the shares."""
 
     def __init__(
@@ -84,7 +84,7 @@ class _OneSample(Sampler):
         return torch.as_tensor(total) / samples
 
 
-class _OptimalSampler(Sampler):
+class OptimalSampler(Sampler):
     """Optimal MIS weights, cross-fitted on the samples themselves."""
 
     def __init__(
