@@ -134,6 +134,13 @@ def test_joints_count_once_and_hairpins_twice() -> None:
     assert exact_crossings(hairpin, ray(-3, 5, 0), ray(2, 0, 0)) == 1
 
 
+def test_a_strand_that_runs_through_itself_is_entered_once() -> None:
+    weave = [[0, 0, 0], [10, 0, 0], [8, 4, 0], [8, -4, 0], [5, -4, 0], [5, 4, 0], [2, 4, 0], [2, -4, 0]]
+    inside = polylines([[float(x) for x in point] for point in weave], radius=0.5)
+    assert exact_crossings(inside, ray(-3, 0.1, 0), ray(1, 0, 0)) == 1
+    assert exact_crossings(inside, ray(-3, 2, 0), ray(1, 0, 0)) == 3  # the slanted piece overlaps the one at x = 8
+
+
 def test_only_the_fibre_at_the_origin_is_left_out() -> None:
     hairpin = polylines([[0, 0, 0], [0, 5, 0], [1, 5, 0], [1, 0, 0]], [[2, 0, 0], [2, 5, 0]])
     direction = ray(1, 0, 0)
