@@ -57,8 +57,8 @@ class RenderProblem(Problem):
         key = int(torch.randint(2**62, (), generator=generator))
         names, place, rank, most = self._layout  # type: ignore[attr-defined]
         hit = contexts.hit.reshape(-1)
-        whole = len(hit) == len(rank)  # nearly always all hits in order
-        place, rank = (place, rank) if whole and bool((hit == torch.arange(len(hit))).all()) else (place[hit], rank[hit])
+        if len(hit) != len(rank) or not bool((hit == torch.arange(len(hit))).all()):  # not all hits in their order
+            place, rank = place[hit], rank[hit]
         rows = max(1, CHUNK // max(1, len(hit)))
         shape = contexts.batch_shape
         if self.uniforms == "random":

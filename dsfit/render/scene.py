@@ -7,7 +7,6 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
 
 from dsfit.bsdf.dual_scattering import DualScattering
 from dsfit.context import Context
@@ -155,7 +154,7 @@ class RenderScene:
             hinted = self.grid.hints(Context(theta_r, phi_r))
             n, v = hinted.n, hinted.v
         else:
-            n, v = self.grid.hints(hits.position)
+            n, v = self.grid.hints(hits.position, self.v)
         return HitContext(theta_r, phi_r, n.to(omega), v.to(omega), hit=torch.arange(len(hits)))
 
     def integrand(self, hits: Hits, *, exact: bool = False) -> HairIntegrand:
