@@ -16,7 +16,7 @@ from dsfit.experiment.validation import Experiment
 @dataclass(frozen=True)
 class Job:
     """One cell: a context of a grid point, a whole grid point for `transmittance`, a suite's part for `check`, a peer
-    over one group of contexts for `race`.
+    over one group of contexts for `race`, a technique for `compare_render`.
 
     Attributes:
         index: position in the run.
@@ -48,6 +48,12 @@ def jobs(experiment: Experiment) -> list[Job]:
             for work in races_of(point.config):
                 identity = {"grid": point.values, **work}
                 found.append(Job(len(found), _label(point.config, identity), identity, point.config))
+            continue
+        if experiment.config.kind == "compare_render":
+            from dsfit.experiment.compare_render import work_of as techniques_of
+
+            for work in techniques_of(point.config):
+                found.append(Job(len(found), work["technique"], {"grid": point.values, **work}, point.config))
             continue
         values = list(build.context_values(point.config.contexts))
         for context in [{}] if experiment.config.kind in ("transmittance", "amortise") else values:
@@ -93,6 +99,10 @@ def run_job(directory: RunDirectory, job: Job, say: Callable[[str], None]) -> No
         from dsfit.experiment.race import race
 
         data, arrays = race(job.config, job.identity, directory, say)
+    elif job.config.kind == "compare_render":
+        from dsfit.experiment.compare_render import compare_render
+
+        data, arrays = compare_render(job.config, job.identity, directory, say)
     elif job.config.kind == "amortise":
         from dsfit.experiment.amortise import amortise
 

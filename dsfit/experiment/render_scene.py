@@ -16,7 +16,7 @@ import torch
 from dsfit.errors import InputError
 from dsfit.experiment import build
 from dsfit.experiment.schema import Config
-from dsfit.experiment.schema_render import GeometryConfig
+from dsfit.experiment.schema_render import GeometryConfig, Technique
 
 if TYPE_CHECKING:
     from dsfit.experiment.reader import RawConfig
@@ -135,12 +135,15 @@ def camera_of(config: Config, strands: Strands) -> Camera:
 
 def scene_of(config: Config) -> RenderScene:
     """The scene; the last two are kept, so that all tiles and techniques of a process share one."""
+    return _scene(key_of(config), _Kept(config))
+
+
+def key_of(config: Config) -> tuple[Any, ...]:
+    """Equal for configs of equal scenes, as long as the files that they name do not change."""
     parts = {"geometry", "camera", "grid", "fiber", "bsdf", "light"}
-    key = config.model_dump_json(include=parts) + config.render.model_dump_json(
-        include={"subsamples", "v", "background", "dtype", "seed"}
-    )
+    asked = {"subsamples", "v", "background", "dtype", "seed"}
     stamps = tuple(os.stat(path).st_mtime_ns for path in _files(config) if os.path.exists(path))
-    return _scene(key, stamps, _Kept(config))
+    return config.model_dump_json(include=parts), config.render.model_dump_json(include=asked), stamps
 
 
 def _files(config: Config) -> list[str]:
@@ -149,7 +152,7 @@ def _files(config: Config) -> list[str]:
 
 
 @functools.lru_cache(maxsize=2)
-def _scene(_key: str, _stamps: tuple[int, ...], kept: _Kept) -> RenderScene:
+def _scene(_key: tuple[Any, ...], kept: _Kept) -> RenderScene:
     from dsfit.render.scene import RenderScene
 
     config: Config = kept.value
@@ -190,3 +193,29 @@ def check(raw: RawConfig, config: Config) -> None:
         camera_of(config, strands)
     except InputError as error:
         raise library_error(raw, "camera", error) from None
+    check_technique(raw, ("render", "technique"), config.render.technique)
+    if config.kind == "compare_render":
+        from dsfit.experiment.compare_render import check as check_comparison
+
+        check_comparison(raw, config)
+
+
+def check_technique(raw: RawConfig, key: tuple[str | int, ...], technique: Technique) -> None:
+    """Refuse a technique that cannot be made.
+
+    Raises:
+        ConfigError: naming the key.
+    """
+    from dsfit.experiment.reader import did_you_mean
+    from dsfit.render.techniques import TECHNIQUES
+    from dsfit.render.techniques import technique as make
+
+    if technique.kind not in TECHNIQUES:
+        known = "one of " + ", ".join(TECHNIQUES) + did_you_mean(technique.kind, TECHNIQUES)
+        raise raw.error((*key, "kind"), known, technique.kind)
+    try:
+        make(technique.kind, technique.options, light=technique.light, uniforms=technique.uniforms)
+    except InputError as error:
+        name = error.field.rpartition(".")[2]
+        where = ("options", name) if name in technique.options else ("light",) if name == "light" else ("options",)
+        raise raw.error((*key, *where), f"{error.allowed} ({error.field})", error.value) from None

@@ -7,6 +7,7 @@ cells/0003.npz     its maps and raw estimates
 proposals/0003-NAME.npz   its fitted proposals (`dsfit.load_proposal`)
 result.json        everything in one file; written last, so it marks the run as finished
 table.md  figures/*.png  figures/*.pdf
+images/*.exr  images/*.png   what was rendered
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from dsfit.errors import InputError
 from dsfit.experiment import files
 from dsfit.experiment.schema import SCHEMA_VERSION
 
-_OWN = ("config.toml", "provenance.json", "result.json", "table.md", "cells", "proposals", "figures")
+_OWN = ("config.toml", "provenance.json", "result.json", "table.md", "cells", "proposals", "figures", "images")
 
 
 class RunFailure(RuntimeError):

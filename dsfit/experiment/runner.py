@@ -92,7 +92,7 @@ def run(
         experiment: from `validation.load`.
         out: folder of run directories instead of `output.dir`.
         force: throw away what an earlier run of the same experiment left.
-        workers: processes with one thread each; left out, the number of cores, for a race 1; 0 runs in this process.
+        workers: processes with one thread each; left out, the number of cores, 1 where times are compared; 0 runs in this process.
         progress: told what goes on.
 
     Raises:
@@ -114,15 +114,13 @@ def run(
         todo = jobs(experiment)
         done = {job.index for job in todo if directory.cell(job.index, job.identity) is not None}
         pending = [job for job in todo if job.index not in done]
-        if workers is None:  # peers that race side by side disturb each other
-            workers = 1 if experiment.config.kind == "race" else cores()
+        if workers is None:  # what is timed side by side disturbs each other
+            workers = 1 if experiment.config.kind in ("race", "compare_render") else cores()
         workers = min(workers, len(pending))
         session = {"started": started, "workers": workers, "threads_per_worker": 1, "cells_reused": len(done)}
-        record = {
-            **provenance.provenance(),
-            "seed": experiment.config.estimate.seed,
-            "dtype": experiment.config.estimate.dtype,
-        }
+        rendered = experiment.config.kind in ("render", "compare_render")
+        numbers = experiment.config.render if rendered else experiment.config.estimate
+        record = {**provenance.provenance(), "seed": numbers.seed, "dtype": numbers.dtype}
         sessions = [*directory.provenance().get("sessions", []), session]
         directory.write_json("provenance.json", {**record, "sessions": sessions})
         progress.start(len(todo), len(done))

@@ -121,8 +121,8 @@ class GridConfig(Section):
     """`[grid]`: voxels along the longest side; the march's step in voxels (left out: the grid's own choice); and the
     largest n."""
 
-    resolution: Annotated[int, Field(ge=2, le=1024)] = 64
-    step: Annotated[float, Field(gt=0, le=10)] | None = None
+    resolution: Annotated[int, Field(ge=1, le=512)] = 64
+    step: Annotated[float, Field(gt=0, le=1)] | None = None
     max_n: Positive = 100.0
 
 
