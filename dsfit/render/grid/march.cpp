@@ -23,9 +23,11 @@ INLINE V vmin(V a, V b) { return a < b ? a : b; }
 INLINE V vmax(V a, V b) { return a > b ? a : b; }
 INLINE V root(V x) { V r; for (int l = 0; l < W; l++) r[l] = __builtin_sqrtf(x[l]); return r; }
 INLINE float total(V x) {
-    float r = 0;
-    for (int l = 0; l < W; l++) r += x[l];
-    return r;
+    float part[W];
+    std::memcpy(part, &x, 64);
+    for (int half = W / 2; half > 0; half /= 2)
+        for (int l = 0; l < half; l++) part[l] += part[l + half];
+    return part[0];
 }
 
 // The components of eight pairs of samples: rows[s] holds sample s in its lower half and s + 8 in its upper one.
@@ -96,10 +98,9 @@ INLINE float march(const Field& f, const Ray& r) {
         std::memcpy(w11, &v11, 64); std::memcpy(w10, &v10, 64); std::memcpy(w01, &v01, 64); std::memcpy(w00, &v00, 64);
         std::memcpy(up, &part[2], 64);
         V sample[W];
-        for (int s = 0; s < W; s++) {
-            const float* p = f.moments + at[s];
-            sample[s] = w00[s] * load(p) + w01[s] * load(p + row) + w10[s] * load(p + slab) + w11[s] * load(p + slab + row);
-        }
+#define SAMPLE(from, to) for (int s = from; s < to; s++) { const float* p = f.moments + at[s]; sample[s] = w00[s] * load(p) + w01[s] * load(p + row) + w10[s] * load(p + slab) + w11[s] * load(p + slab + row); }
+        SAMPLE(0, 8)
+        if (steps - first > 8) SAMPLE(8, 16) else for (int s = 8; s < W; s++) sample[s] = V{};
         V rows[8];
         const I lower = {0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23};
         const I upper = {8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31};

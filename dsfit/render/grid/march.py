@@ -16,10 +16,12 @@ if TYPE_CHECKING:
 SPREAD = 3 * (1 - math.pi / 4 * math.sqrt(3 / 2))
 """k of `DensityGrid`: makes isotropic tangents exact."""
 
-SELF = 0.5
-"""c of `DensityGrid.crossings`."""
+SELF = 0.386
+"""c of `DensityGrid.crossings`: half the density, on a plane through its centre, of what cutting at the faces of a
+voxel and interpolating between voxels make of a point (a quadratic B-spline along each axis, in voxels); mean over
+planes, which spread by 0.02. (A normal distribution of the same variance, 1/4, has 0.399.)"""
 
-_SAMPLES = 1 << 19
+_SAMPLES = 1 << 18
 """Points of rays that are held at once."""
 
 
@@ -44,17 +46,17 @@ def _march(grid: DensityGrid, field: Tensor, origin: Tensor, direction: Tensor) 
     start = (origin - grid.low.to(origin)) / grid.voxel + 0.5
     top = torch.tensor([size + 1.0 for size in grid.shape], dtype=origin.dtype)
     enter, leave = _interval(start, d, top)
-    steps = int(torch.ceil((leave - enter).detach().max() / grid.step).clamp_min(0)) if len(start) else 0
-    if steps == 0:
-        return 0 * (start.sum(-1) + d.sum(-1) + field.sum())
-    t = enter[:, None] + (torch.arange(steps, dtype=origin.dtype) + 0.5) * grid.step
-    place = start[:, None] + t[..., None] * d[:, None]
+    steps = torch.ceil((leave - enter).detach() / grid.step).long()
+    ray = torch.arange(len(steps)).repeat_interleave(steps)
+    turn = torch.arange(len(ray)) - (steps.cumsum(0) - steps)[ray]
+    t = enter[ray] + (turn + 0.5) * grid.step
+    place = start[ray] + t[:, None] * d[ray]
+    # The field is zero at the border and beyond: the last step, which may reach past it, adds nothing there.
+    place = torch.minimum(place.clamp_min(0.0), top)
     scaled = (2 * place / top - 1).flip(-1)  # grid_sample counts axes from the last
-    moments = grid_sample(field, scaled[None, None], mode="bilinear", padding_mode="zeros", align_corners=True)
-    rate = crossing_rate(moments[0, :, 0], d[:, None])
-    # The field is zero at the border and beyond: steps that reach past it add nothing.
-    inside = (place.detach() >= 0).all(-1) & (place.detach() <= top).all(-1)
-    n = torch.where(inside, rate, 0.0).sum(-1) * (grid.step * grid.voxel)
+    moments = grid_sample(field, scaled[None, None, None], mode="bilinear", padding_mode="zeros", align_corners=True)
+    rate = crossing_rate(moments[0, :, 0, 0], d[ray])
+    n = torch.zeros_like(enter).index_add(0, ray, rate) * (grid.step * grid.voxel)
     return n.clamp_max(grid.max_n)
 
 

@@ -11,7 +11,6 @@ from dsfit.context import Context
 from dsfit.errors import InputError
 from dsfit.frame import to_vector
 from dsfit.render.grid.density import DensityGrid
-from dsfit.render.grid.march import SELF
 from dsfit.render.hits import HitContext, Hits
 from dsfit.scene.scattering import Scattering
 
@@ -33,7 +32,7 @@ class GridScattering(Scattering):
     def __init__(self, grid: DensityGrid, hits: Hits, v: Any = "poisson") -> None:
         super().__init__(v)
         self.grid, self.hits = grid, hits
-        self._own = hits.radius * (2 * SELF / grid.voxel)
+        self._own = grid.own_crossings(hits.radius)
         self._rays = [x.detach().to(torch.float32).contiguous() for x in (hits.position, hits.frame)]
 
     def crossings(self, omega_i: Tensor, context: Context) -> Tensor:
