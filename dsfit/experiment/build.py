@@ -17,6 +17,7 @@ from dsfit.bsdf import Convention, DualScattering, Fiber
 from dsfit.context import Context
 from dsfit.errors import InputError
 from dsfit.experiment.schema import Config, ContextsConfig, FiberConfig
+from dsfit.experiment.schema_lights import light_paths
 
 if TYPE_CHECKING:
     from dsfit.experiment.reader import RawConfig
@@ -58,22 +59,9 @@ def bsdf(config: Config, dtype: torch.dtype = torch.float64) -> DualScattering:
 
 def light(config: Config) -> Light:
     """The light; reads the map of an environment light."""
-    from dsfit import scene
+    from dsfit.experiment.lights import made
 
-    c = config.light
-    if c.kind == "constant":
-        return scene.ConstantLight(c.radiance)
-    if c.kind == "environment":
-        return scene.EnvironmentLight.from_file(c.path, scale=c.scale)
-    directions = [[lobe.theta_deg * _DEG, lobe.phi_deg * _DEG] for lobe in c.lobes]
-    kappa = [float(scene.VonMisesFisherLights.kappa_of_width(lobe.width_deg * _DEG)) for lobe in c.lobes]
-    intensity = [lobe.intensity if isinstance(lobe.intensity, list) else [lobe.intensity] for lobe in c.lobes]
-    channels = max(map(len, intensity))
-    for index, value in enumerate(intensity):
-        if len(value) not in (1, channels):
-            raise InputError(f"light.lobes.{index}.intensity", value, f"a number or a list of {channels} numbers")
-    full = [value * channels if len(value) == 1 else value for value in intensity]
-    return scene.VonMisesFisherLights(torch.tensor(directions, dtype=torch.float64), kappa, full, c.ambient)
+    return made(config.light)
 
 
 def scattering(config: Config) -> Scattering | None:
@@ -91,9 +79,8 @@ def scattering(config: Config) -> Scattering | None:
 def integrand(config: Config, dtype: torch.dtype = torch.float64) -> Any:
     """BSDF x light x scattering; the last few are kept, because the BSDF's tables take a second to make."""
     scene = config.model_dump_json(include={"fiber", "bsdf", "light", "scattering"})
-    path = getattr(config.light, "path", None)
-    status = os.stat(path) if path and os.path.exists(path) else None
-    return _integrand(_Scene(config, (scene, status and (status.st_mtime_ns, status.st_size))), dtype)
+    found = [os.stat(path) for path in light_paths(config.light) if os.path.exists(path)]
+    return _integrand(_Scene(config, (scene, *((x.st_mtime_ns, x.st_size) for x in found))), dtype)
 
 
 @dataclass(frozen=True)

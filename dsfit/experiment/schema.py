@@ -8,6 +8,7 @@ from pydantic import Field
 
 from dsfit.experiment.check_schema import CheckConfig
 from dsfit.experiment.schema_amortise import AmortiseConfig, AmortisedMethod
+from dsfit.experiment.schema_lights import ConstantLight, Inclination, LightConfig, NonNegative, Positive, Vector
 from dsfit.experiment.schema_plan import PlanConfig
 from dsfit.experiment.schema_race import RaceConfig
 from dsfit.experiment.schema_render import (
@@ -22,11 +23,7 @@ from dsfit.experiment.sections import Section
 
 SCHEMA_VERSION = 1
 
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
-Channels = NonNegative | Annotated[list[NonNegative], Field(min_length=1)]
-Inclination = Annotated[float, Field(ge=-90, le=90)]
 Name = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[^\x00-\x1f/\\]+$")]
 Preset = Literal["nonabsorbing", "blond", "brown", "black"]
 HeuristicName = Literal["balance", "power", "maximum", "cutoff", "optimal"]
@@ -62,39 +59,6 @@ class BsdfConfig(Section):
     precision: Literal["auto", "exact", "table"] = "auto"
 
 
-class ConstantLight(Section):
-    """`[light] kind = "constant"`: the same radiance from everywhere."""
-
-    kind: Literal["constant"] = "constant"
-    radiance: Channels = 1.0
-
-
-class LobeConfig(Section):
-    """One von Mises-Fisher lobe; `intensity` is its radiance integrated over the sphere, so that width does not
-    change its power."""
-
-    theta_deg: Inclination
-    phi_deg: float = 0.0
-    width_deg: Annotated[float, Field(ge=0.06, le=180)]
-    intensity: Channels = 1.0
-
-
-class LobesLight(Section):
-    """`[light] kind = "lobes"`: lobes over a constant ambient radiance."""
-
-    kind: Literal["lobes"]
-    lobes: Annotated[list[LobeConfig], Field(min_length=1)]
-    ambient: Channels = 0.0
-
-
-class EnvironmentLight(Section):
-    """`[light] kind = "environment"`: an equirectangular EXR map; `path` is relative to the file that names it."""
-
-    kind: Literal["environment"]
-    path: Annotated[str, Field(min_length=1)]
-    scale: Positive = 1.0
-
-
 class ConstantScattering(Section):
     """`[scattering] kind = "constant"`: n and v are those of `[contexts]`."""
 
@@ -102,7 +66,6 @@ class ConstantScattering(Section):
 
 
 LitShare = Literal["poisson", "threshold"] | Share
-Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Hint = Literal["transmitted", "mean", "forward"]
 
 
@@ -203,7 +166,6 @@ MethodConfig = Annotated[
     UniformMethod | LightMethod | SingleMethod | HeuristicMixMethod | FittedMethod | AmortisedMethod,
     Field(discriminator="kind"),
 ]
-LightConfig = Annotated[ConstantLight | LobesLight | EnvironmentLight, Field(discriminator="kind")]
 ScatteringConfig = Annotated[ConstantScattering | SlabScattering | SphereScattering, Field(discriminator="kind")]
 
 

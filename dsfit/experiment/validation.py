@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 import types
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -68,9 +69,12 @@ def _anchor_paths(raw: RawConfig) -> None:
         source = Path(raw.source(key))
         return str(((source.parent if source.is_file() else Path()) / path).resolve())
 
-    for section in ("light", "geometry"):
-        if raw.lookup((section, "path")) is not None:
-            raw.data[section]["path"] = anchored((section, "path"), raw.lookup((section, "path")))
+    lights = raw.lookup(("light", "lights"))
+    parts = [("light", "lights", k) for k in range(len(lights))] if isinstance(lights, list) else []
+    for where in (("light",), ("geometry",), *parts):
+        table = raw.lookup(where)
+        if isinstance(table, dict) and "path" in table:
+            table["path"] = anchored((*where, "path"), table["path"])
     methods = raw.lookup(("methods",))
     for k, method in enumerate(methods if isinstance(methods, list) else []):
         if isinstance(method, dict) and "file" in method:
@@ -167,6 +171,11 @@ def library_error(raw: RawConfig, section: str, error: InputError) -> ConfigErro
     if isinstance(error, ConfigError):
         return error
     leaf = error.field.split(".")[-1].split("[")[0]
+    within = re.match(r"light\.lights\.(\d+)\.", error.field)  # a part of a total light
+    if within:
+        place = ("light", "lights", int(within[1]))
+        found = [(*place, key) for key in (leaf, f"{leaf}_deg") if raw.lookup((*place, key)) is not None]
+        return raw.error(found[0] if found else place, f"{error.allowed} ({error.field})")
     for candidate in ((section, leaf), (section, f"{leaf}_deg"), (section,)):
         if raw.lookup(candidate) is not None:
             return raw.error(candidate, f"{error.allowed} ({error.field})")

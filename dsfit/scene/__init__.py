@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from dsfit.scene.exr import ExrImage, read_exr, write_exr
 from dsfit.scene.integrand import Integrand
-from dsfit.scene.lights import ConstantLight, EnvironmentLight, Light, VonMisesFisherLights
+from dsfit.scene.lights import (
+    ConstantLight,
+    EnvironmentLight,
+    Light,
+    SphereLight,
+    SunLight,
+    TotalLight,
+    VonMisesFisherLights,
+)
 from dsfit.scene.scattering import ConstantScattering, Scattering, SlabScattering, SphereScattering
 
 __all__ = [
@@ -16,7 +24,10 @@ __all__ = [
     "Light",
     "Scattering",
     "SlabScattering",
+    "SphereLight",
     "SphereScattering",
+    "SunLight",
+    "TotalLight",
     "VonMisesFisherLights",
     "read_exr",
     "write_exr",

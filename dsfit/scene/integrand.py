@@ -14,7 +14,8 @@ from dsfit.bsdf.dual_scattering import DualScattering
 from dsfit.context import Context
 from dsfit.errors import InputError
 from dsfit.frame import HALF_PI, theta_diff, wrap
-from dsfit.scene.lights import ConstantLight, Light, VonMisesFisherLights
+from dsfit.scene.lights import ConstantLight, Light, TotalLight, VonMisesFisherLights
+from dsfit.scene.lights.cones import ConeLight
 from dsfit.scene.scattering import ConstantScattering, Scattering, SlabScattering, SphereScattering
 from dsfit.special import is_differentiated
 
@@ -87,10 +88,11 @@ class Integrand:
                 points += [(edges - HALF_PI).abs(), math.pi - (edges - HALF_PI).abs()]
             points.append(torch.full_like(diff, HALF_PI).unsqueeze(-1))
         half = torch.cat(points, dim=-1)
-        azimuths = [] if self.is_even else self._light_azimuths()
+        azimuths = [] if self.is_even else self.scattering.breakpoints()[1]
         extra = [float(wrap(context.phi_r.detach() - p)) for p in azimuths]
         fixed = torch.tensor([-math.pi, 0.0, math.pi, *extra], dtype=theta_i.dtype).expand(*theta_i.shape, -1)
-        return torch.sort(torch.cat([half, -half, fixed], dim=-1), dim=-1).values.detach()
+        lights = [] if self.is_even else [self._light_edges(context, theta_i)]
+        return torch.sort(torch.cat([half, -half, fixed, *lights], dim=-1), dim=-1).values.detach()
 
     def _support_edges(self, diff: Tensor, lobes: tuple[int, ...]) -> Tensor:
         fiber = self.bsdf.fiber
@@ -100,8 +102,15 @@ class Integrand:
         both = [support_edges(fiber, diff, torch.full_like(diff, a), lobes) for a in (0.0, HALF_PI)]
         return torch.cat(both, dim=-1)
 
-    def _light_azimuths(self) -> list[float]:
-        return [*self.light.breakpoints()[1], *self.scattering.breakpoints()[1]]
+    def _light_edges(self, context: Context, theta_i: Tensor) -> Tensor:
+        """Relative azimuths of the light's edges, `[..., J]`, continuous in theta_i: one that leaves [-pi, pi] stays at
+        the end, and a second one comes in at the other."""
+        centre, offset, reach = self.light.azimuth_edges(theta_i.detach())
+        base = wrap(context.phi_r.detach() - centre)
+        edges = base - offset
+        leaves = base.abs() + reach > math.pi
+        again = edges[..., leaves] - 2 * math.pi * torch.where(base[leaves] < 0, -1.0, 1.0)
+        return torch.cat([edges, again], dim=-1).clamp(-math.pi, math.pi)
 
     def _lit(self, context: Context) -> bool:
         constant = isinstance(self.scattering, ConstantScattering)
@@ -120,8 +129,13 @@ def _turns(surroundings: Light | Scattering) -> bool:
     """
     if isinstance(surroundings, ConstantLight | ConstantScattering):
         return True
+    if isinstance(surroundings, TotalLight):
+        return all(map(_turns, surroundings.lights))
     if isinstance(surroundings, VonMisesFisherLights):
         axes = surroundings.to_fibre_means()
+    elif isinstance(surroundings, ConeLight):
+        cone = surroundings.cone()
+        axes = torch.where((cone.rise > 1.5)[..., None], cone.axis.new_tensor([1.0, 0.0, 0.0]), cone.axis)
     elif isinstance(surroundings, SlabScattering):
         axes = surroundings.normal
     elif isinstance(surroundings, SphereScattering):

@@ -1,4 +1,4 @@
-"""Lights: constant, von Mises-Fisher lobes, equirectangular environment maps."""
+"""Lights: constant, von Mises-Fisher lobes, environment maps, sun, sphere, and sums of them."""
 
 from __future__ import annotations
 
@@ -6,5 +6,16 @@ from dsfit.scene.lights.base import Light
 from dsfit.scene.lights.constant import ConstantLight
 from dsfit.scene.lights.environment import EnvironmentLight
 from dsfit.scene.lights.lobes import VonMisesFisherLights
+from dsfit.scene.lights.sphere import SphereLight
+from dsfit.scene.lights.sun import SunLight
+from dsfit.scene.lights.total import TotalLight
 
-__all__ = ["ConstantLight", "EnvironmentLight", "Light", "VonMisesFisherLights"]
+__all__ = [
+    "ConstantLight",
+    "EnvironmentLight",
+    "Light",
+    "SphereLight",
+    "SunLight",
+    "TotalLight",
+    "VonMisesFisherLights",
+]

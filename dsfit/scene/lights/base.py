@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import math
 from abc import ABC, abstractmethod
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -46,6 +47,8 @@ class Light(nn.Module, ABC):
     channels: int
     """C, the number of colour channels."""
     rotation: Tensor | None
+    batched: dict[str, int] = {"rotation": 2}
+    """Buffers that may have one value per context, and how many dimensions one value has."""
 
     def __init__(self, rotation: Any = None) -> None:
         super().__init__()
@@ -74,19 +77,59 @@ class Light(nn.Module, ABC):
         """
         return [], []
 
-    def rotated(self, rotation: Any) -> Light:
-        """The same light in another frame, sharing all tables: one light serves every fibre of a scene."""
-        other = copy.copy(self)
-        other._buffers = dict(self._buffers)
-        other._buffers["rotation"] = check_rotation(rotation)
-        return other
+    def power(self) -> Tensor:
+        """What arrives from all directions together, `int mean_c L_c domega`, `[]` or one per context `[*batch]`.
 
-    def placed(self, position: Tensor, rotation: Tensor) -> Light:
+        By this a `TotalLight` shares out its samples; a light that has no closed form gives a close approximation.
+
+        Raises:
+            InputError: the light does not know it.
+        """
+        raise InputError("light", type(self).__name__, "a light that knows its power")
+
+    def covers(self) -> bool:
+        """Whether the proposal's density is certainly above zero in every direction; False where that is not known."""
+        return False
+
+    def azimuth_edges(self, theta_i: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Absolute azimuths phi_i where the light jumps, peaks or has a kink at inclinations `[...]`.
+
+        Returns:
+            centre, `[J]`; offsets from it, `[..., J]`, in [-pi, pi], continuous in theta_i between the breakpoints; and
+            the largest that an offset can be, `[J]`. The azimuths are `centre + offset`, not wrapped. By default the
+            breakpoints in phi, whatever the inclination.
+        """
+        centre = theta_i.new_tensor(self.breakpoints()[1])
+        return centre, theta_i.new_zeros(()).expand(*theta_i.shape, len(centre)), torch.zeros_like(centre)
+
+    def rotated(self, rotation: Any) -> Self:
+        """The same light in another frame, sharing all tables: one light serves every fibre of a scene."""
+        return self._with_buffers(rotation=check_rotation(rotation))
+
+    def placed(self, position: Tensor, rotation: Tensor) -> Self:
         """The light as points `[*batch, 3]` of the world with fibre frames `[*batch, 3, 3]` see it.
 
         Lights at infinity look the same from everywhere, so only their rotation matters; lights nearby override this.
         """
         return self.rotated(rotation)
+
+    def _with_buffers(self, **buffers: Tensor | None) -> Self:
+        other = copy.copy(self)
+        other._buffers = {**self._buffers, **buffers}
+        return other
+
+    def taken(self, batch_shape: torch.Size, index: Tensor) -> Self | None:
+        """The light of the contexts `index` `[N]` of a flattened batch; None if it has values for a larger batch."""
+        chosen: dict[str, Tensor | None] = {}
+        for name, dimensions in self.batched.items():
+            value = self._buffers.get(name)
+            if value is None or value.dim() == dimensions:
+                continue
+            batch, one = value.shape[: value.dim() - dimensions], value.shape[value.dim() - dimensions :]
+            if torch.broadcast_shapes(batch, batch_shape) != batch_shape:
+                return None
+            chosen[name] = value.expand(*batch_shape, *one).reshape(-1, *one)[index]
+        return self._with_buffers(**chosen) if chosen else self
 
     def world_vector(self, omega_i: Tensor) -> Tensor:
         """Unit vectors `[..., 3]` in the frame of the light's description."""
@@ -146,7 +189,14 @@ class LightDistribution(Distribution):
 
     def __init__(self, light: Light, context: Context) -> None:
         self.light = light
+        self.context = context
         self.batch_shape = context.batch_shape
+
+    def select(self, take: Callable[[Tensor], Tensor]) -> Self | None:
+        count = self.batch_shape.numel()
+        index = take(torch.arange(count, device=self.context.device).reshape(self.batch_shape))
+        light = self.light.taken(self.batch_shape, index)
+        return None if light is None else type(self)(light, self.context._map(take))
 
     def sample_with_log_prob(self, u: Tensor) -> tuple[Tensor, Tensor]:
         # The density of the returned direction, not of the one before rounding: what other strategies of a MIS estimate

@@ -46,6 +46,12 @@ class ConstantLight(Light):
         check_directions(omega_i, field="omega_i")
         return self.radiance.to(omega_i).expand(*omega_i.shape[:-1], self.channels)
 
+    def power(self) -> Tensor:
+        return 4 * math.pi * self.radiance.mean()
+
+    def covers(self) -> bool:
+        return True
+
     def proposal(self) -> Proposal:
         """Uniform directions, also for a black light."""
         return ConstantLightProposal(self)

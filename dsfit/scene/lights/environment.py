@@ -163,6 +163,13 @@ class EnvironmentLight(Light):
         t, s = t.unsqueeze(-1), s.unsqueeze(-1)
         return self.scale * ((1 - t) * ((1 - s) * a + s * b) + t * ((1 - s) * c + s * d))
 
+    def power(self) -> Tensor:
+        """The integral of the sampling density, which differs from that of the radiance by the square of a texel."""
+        return self.row_mass[-1] * (self.scale * self.image.detach().to(torch.float64).mean(-1).amax())
+
+    def covers(self) -> bool:
+        return bool((self.luminance > 0).all())
+
     def proposal(self) -> Proposal:
         """Directions by the map's luminance; exact density, positive wherever the radiance is."""
         return EnvironmentProposal(self)

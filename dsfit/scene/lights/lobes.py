@@ -145,6 +145,14 @@ class VonMisesFisherLights(Light):
         """∫ L dω `[C]`."""
         return self.intensity.sum(0) + 4 * math.pi * self.ambient
 
+    def power(self) -> Tensor:
+        return self.total().mean()
+
+    def covers(self) -> bool:
+        """With an ambient, or with a lobe whose far side, `exp(-2 kappa)`, is no smaller than e^-60."""
+        wide = (self.kappa <= 30) & (self.intensity.mean(-1) > 0)
+        return bool((self.ambient > 0).any()) or bool(wide.any())
+
     def proposal(self) -> Proposal:
         """Exact mixture of the lobes and a uniform part for the ambient, by power averaged over the channels."""
         return LobesProposal(self)

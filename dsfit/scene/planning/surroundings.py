@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dsfit.scene.lights import ConstantLight, EnvironmentLight, Light, VonMisesFisherLights
+from dsfit.scene.lights import ConstantLight, EnvironmentLight, Light, TotalLight, VonMisesFisherLights
+from dsfit.scene.lights.cones import ConeLight
 from dsfit.scene.lights.lobes import log_normaliser
 from dsfit.scene.planning.boxes import Boxes, growing
 from dsfit.scene.planning.interval import Interval
@@ -29,8 +30,19 @@ def radiance(light: Light) -> Radiance | None:
     """Bounds on a light; None where nothing is known of it.
 
     Lobes: each is largest at its mean direction, C(kappa), and least opposite to it, C(kappa) exp(-2 kappa). A map: its
-    texels' least and largest, between which bilinear interpolation stays.
+    texels' least and largest, between which bilinear interpolation stays. Emitters with an edge: dark somewhere, never
+    above their radiance; of several positions, the one that sees most counts. A total: the sums.
     """
+    if type(light) is TotalLight:
+        found = [radiance(one) for one in light.lights]
+        if any(part is None for part in found):
+            return None
+        parts = [(part.low, part.high, part.total) for part in found if part is not None]
+        return Radiance(*(sum(x) for x in zip(*parts, strict=True)))  # type: ignore[arg-type]
+    if isinstance(light, ConeLight):
+        value, solid = light.radiance.detach().to(torch.float64), 2 * math.pi * light.cone().rise.detach().double()
+        whole = bool((solid > 3 * math.pi).all())
+        return Radiance(value if whole else torch.zeros_like(value), value, value * solid.max())
     if type(light) is ConstantLight:
         value = light.radiance.detach().to(torch.float64)
         return Radiance(value, value, 4 * math.pi * value)
