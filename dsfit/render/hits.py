@@ -10,9 +10,7 @@ from torch import Tensor
 
 from dsfit.context import Context
 from dsfit.errors import check_dtype
-from dsfit.frame import HALF_PI, to_angles
-
-_LIMIT = {dtype: torch.tensor(HALF_PI, dtype=dtype).item() for dtype in (torch.float64, torch.float32)}
+from dsfit.frame import to_angles
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,7 @@ def context_of(hits: Hits, n: Any = 0.0, v: Any = None, dtype: torch.dtype = tor
     Args:
         hits: what the camera sees.
         n, v: scattering hints `[H]` or single numbers, as for `Context`.
-        dtype: of the contexts; theta_r is kept inside its range there.
+        dtype: of the contexts; theta_r is an atan2, so rounding cannot take it beyond what `Context` allows.
 
     Raises:
         InputError: hints out of range or of another length, another dtype.
@@ -85,7 +83,6 @@ def context_of(hits: Hits, n: Any = 0.0, v: Any = None, dtype: torch.dtype = tor
     check_dtype("context.dtype", dtype)
     viewer = (hits.frame.to(torch.float64) @ hits.outgoing.to(torch.float64).unsqueeze(-1)).squeeze(-1)
     theta, phi = to_angles(viewer).to(dtype).unbind(-1)
-    theta = theta.clamp(-_LIMIT[dtype], _LIMIT[dtype])
     return HitContext(theta, phi, n, v, hit=torch.arange(len(hits)), dtype=dtype)
 
 

@@ -31,6 +31,14 @@ def test_tangents_of_a_helix_converge_with_the_square_of_the_spacing() -> None:
     assert worst[0] < 0.06 and worst[0] > 3.4 * worst[1] > 3.4**2 * worst[2]
 
 
+def test_tangents_of_a_circle_are_exact_whatever_the_spacing() -> None:
+    t = torch.tensor([1.0, 3.0] * 20, dtype=torch.float64).cumsum(0) * 0.04
+    place = torch.stack([t.cos(), t.sin(), 0 * t], -1)
+    strands = Strands(place, torch.tensor([0, 40]), torch.full((40,), 0.01, dtype=torch.float64))
+    exact = torch.stack([-t.sin(), t.cos(), 0 * t], -1)
+    assert float((point_tangents(strands) - exact).abs().max()) < 1e-13
+
+
 def test_seen_tangents_are_smooth_along_the_strand() -> None:
     strands, t = helix(161)
     camera = Camera((6.0, 3.0, 1.0), (0.0, 0.0, 1.5), (0.0, 0.0, 1.0), fov_deg=40, width=48, height=48)
