@@ -92,7 +92,8 @@ def run(
         experiment: from `validation.load`.
         out: folder of run directories instead of `output.dir`.
         force: throw away what an earlier run of the same experiment left.
-        workers: processes with one thread each; left out, the number of cores, 1 where times are compared; 0 runs in this process.
+        workers: processes with one thread each; left out, the number of cores, 1 where times are compared; 0 runs in
+            this process.
         progress: told what goes on.
 
     Raises:
