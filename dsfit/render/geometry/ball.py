@@ -26,9 +26,9 @@ from dsfit.render.strands import Strands
 
 def ball(
     seed: int = 0,
-    strands: int = 12000,
+    strands: int = 16000,
     size: float = 5.0,
-    radius: float = 0.006,
+    radius: float = 0.005,
     points: int = 40,
     swirl: float = 0.35,
     flyaways: float = 0.02,
@@ -38,7 +38,7 @@ def ball(
     Strands rooted near the crown lie over those rooted below, in a coat whose outer diameter is about `size`; it shows
     the ring of highlights that combed hair has under a light from above. Centred at the origin. Unit: centimetres.
 
-    Good camera: `suggested_view`, or from straight ahead, `direction=(0, 0.15, 1)`.
+    Good camera: `suggested_view(strands, VIEWS["ball"])`, from straight ahead, a little from above.
 
     Args:
         seed: integer >= 0; the same seed gives the same strands.
@@ -75,11 +75,11 @@ def ball(
     lift = lift + stray * 0.9 * s**2 * uniform((strands, 1), generator, 0.1, 0.5)
     distance = inner + (outer - inner) * 0.95 * lift
     curves = distance[..., None] * _on_sphere(theta, phi)
-    field = Field(0.35 * size, generator)
-    curves = curves + 0.028 * size * (field(curves) - field(curves[:, :1])) * s[:, None]
+    field = Field(0.5 * size, generator)
+    curves = curves + 0.018 * size * (field(curves) - field(curves[:, :1])) * s[:, None]
     curves = clumped(curves, roots, max(1, strands // 50), 0.6, generator)
-    own = 0.006 * size * wander(strands, points, 1.5, generator)
-    curves = curves + own * torch.where(stray, 4.0, 1.0)[..., None]
+    own = 0.006 * size * wander(strands, points, 1.2, generator)
+    curves = curves + own * torch.where(stray, 3.0, 1.0)[..., None]
     tilt = 0.12 * normal((1,), generator).item()
     return to_strands(_tilted(curves, 0.45, tilt), radius, generator, tip=0.25)
 

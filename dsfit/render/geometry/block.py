@@ -35,7 +35,7 @@ def block(
     strands and 40 for 12,000 with the other defaults. Unit: centimetres; the fibres are then about twice as thick as
     human hair, so that these numbers of strands give the scatter counts of a head.
 
-    Good camera: `suggested_view`, from the right, above and in front.
+    Good camera: `suggested_view(strands, VIEWS["block"])`, from the right, above and in front.
 
     Args:
         seed: integer >= 0; the same seed gives the same strands.

@@ -22,7 +22,9 @@ def double_block(
 ) -> Strands:
     """Two cubes of hanging strands: a thin one at x < 0 and a dense one at x > 0, together centred at the origin.
 
-    Unit: centimetres. Good camera: `suggested_view`, from the right, above and in front.
+    Unit: centimetres.
+
+    Good camera: `suggested_view(strands, VIEWS["double_block"])`, from the right, above and in front.
 
     Args:
         seed: integer >= 0; the two blocks differ in more than their density.

@@ -14,6 +14,16 @@ from dsfit.render.strands import Strands
 FIELD_OF_VIEW = 30.0
 """Degrees: a short telephoto lens, as for portraits."""
 
+VIEWS: dict[str, tuple[float, float, float]] = {
+    "block": (0.9, 0.6, 1.0),
+    "double_block": (0.2, 0.3, 1.0),
+    "straight_bundle": (0.0, 0.05, 1.0),
+    "wavy_bundle": (0.0, 0.05, 1.0),
+    "curly_wisp": (0.0, 0.05, 1.0),
+    "ball": (0.0, 0.15, 1.0),
+}
+"""Where to look from at what each generator makes: directions towards the camera, for `suggested_view`."""
+
 
 def suggested_view(
     strands: Strands,
@@ -25,7 +35,7 @@ def suggested_view(
 
     Args:
         direction: from the strands towards the camera `[3]`, not straight up or down; the default is from the front, a
-            little from the right and from above.
+            little from the right and from above; `VIEWS` has one for each generator.
         fov_deg: full vertical angle of view, in (1, 150) degrees.
         margin: free space around the strands, as a factor >= 1 on their size in the picture.
 

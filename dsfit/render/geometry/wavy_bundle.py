@@ -38,7 +38,7 @@ def wavy_bundle(
     The waves set in below the straight roots at the top. Centred in x and z, roots at y = length / 2. Unit:
     centimetres.
 
-    Good camera: `suggested_view(strands, direction=(0, 0.05, 1))`, from the front.
+    Good camera: `suggested_view(strands, VIEWS["wavy_bundle"])`, from the front.
 
     Args:
         seed: integer >= 0; the same seed gives the same strands.
