@@ -1,5 +1,5 @@
-"""The command line: `dsfit run CONFIG`, `dsfit check CONFIG`, `dsfit bench CONFIG`, `dsfit plan CONFIG`,
-`dsfit show RUNDIR`, `dsfit presets`.
+"""The command line: `dsfit run CONFIG`, `dsfit check CONFIG`, `dsfit bench CONFIG`, `dsfit render CONFIG`,
+`dsfit compare-images A.exr REF.exr`, `dsfit plan CONFIG`, `dsfit show RUNDIR`, `dsfit presets`.
 
 Exit codes: 0 done, 1 the run failed (what is done is kept), 2 the config or an argument is wrong (nothing was
 written), 3 a check was not passed, 130 interrupted.
@@ -83,6 +83,36 @@ def bench(
     result = _run(config, [*(set_ or []), 'kind="race"'], out, force, workers)
     if failed(result):
         raise typer.Exit(3)
+
+
+@app.command()
+def render(
+    config: Config, set_: Changes = None, out: Out = None, force: Force = False, workers: Workers = None
+) -> None:
+    """Render a picture of hair, as the config's [geometry], [camera] and [render] say: EXR with variance, scatter
+    counts and times, PNG, and what it took. An interrupted rendering goes on with the tiles that are missing."""
+    _run(config, [*(set_ or []), 'kind="render"'], out, force, workers)
+
+
+@app.command("compare-images")
+def compare_images(
+    image: Annotated[Path, typer.Argument(help="EXR image to be judged.")],
+    reference: Annotated[Path, typer.Argument(help="EXR image to judge it by, of the same size and channels.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for the error maps, instead of the image's.")] = None,
+) -> None:
+    """Compare an image with a reference: RMSE, relative MSE and FLIP, what of them is the reference's own noise, and
+    maps of the errors."""
+    from dsfit.errors import InputError
+    from dsfit.experiment.compare_images import compare_files, table
+
+    try:
+        found = compare_files(image, reference, out)
+    except InputError as error:
+        _fail(str(error), 2)
+    except OSError as error:
+        _fail(f"{error.filename}: {error.strerror}", 1)
+    _console().print(table(found))
+    _console().print(f"error maps: {found.picture}", soft_wrap=True)
 
 
 def _run(config: Path, changes: list[str], out: Path | None, force: bool, workers: int | None) -> dict[str, Any]:
@@ -182,6 +212,8 @@ def _report(directory: RunDirectory, result: dict[str, Any], draw: bool) -> None
 
         plots.draw_all(directory, result)
     console.print(f"results:   {directory.path / 'result.json'}", soft_wrap=True)
+    if (image := directory.path / "image.exr").is_file():
+        console.print(f"image:     {image}, image.png", soft_wrap=True)
     if (fitted := directory.path / "proposals").is_dir():
         console.print(f"proposals: {fitted} (dsfit.load_proposal)", soft_wrap=True)
     if figures.is_dir():

@@ -176,3 +176,7 @@ def check(raw: RawConfig, config: Config) -> None:
         from dsfit.experiment.render_scene import check as check_scene
 
         check_scene(raw, config)
+    if config.kind == "render":
+        from dsfit.experiment.render import check as check_render
+
+        check_render(raw, config)

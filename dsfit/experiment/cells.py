@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,8 @@ from dsfit.experiment.validation import Experiment
 @dataclass(frozen=True)
 class Job:
     """One cell: a context of a grid point, a whole grid point for `transmittance`, a suite's part for `check`, a peer
-    over one group of contexts for `race`, a technique for `compare_render`.
+    over one group of contexts for `race`, a tile for `render`, a technique for
+    `compare_render`.
 
     Attributes:
         index: position in the run.
@@ -35,31 +36,33 @@ def jobs(experiment: Experiment) -> list[Job]:
     """All cells, in a fixed order."""
     found: list[Job] = []
     for number, point in enumerate(experiment.points):
-        if experiment.config.kind == "check":
-            from dsfit.experiment.checking import work_of
-
-            for work in work_of(point.config, first=number == 0):
-                identity = {"grid": point.values, **work}
-                found.append(Job(len(found), _label(point.config, identity), identity, point.config))
-            continue
-        if experiment.config.kind == "race":
-            from dsfit.experiment.race import work_of as races_of
-
-            for work in races_of(point.config):
-                identity = {"grid": point.values, **work}
-                found.append(Job(len(found), _label(point.config, identity), identity, point.config))
-            continue
-        if experiment.config.kind == "compare_render":
-            from dsfit.experiment.compare_render import work_of as techniques_of
-
-            for work in techniques_of(point.config):
-                found.append(Job(len(found), work["technique"], {"grid": point.values, **work}, point.config))
-            continue
-        values = list(build.context_values(point.config.contexts))
-        for context in [{}] if experiment.config.kind in ("transmittance", "amortise") else values:
-            identity = {"grid": point.values, "context": context}
+        for work in _work_of(point.config, first=number == 0):
+            identity = {"grid": point.values, **work}
             found.append(Job(len(found), _label(point.config, identity), identity, point.config))
     return found
+
+
+def _work_of(config: Config, first: bool) -> Iterable[dict[str, Any]]:
+    """Identities of the cells of one grid point; `first` says whether it is the first one."""
+    if config.kind == "check":
+        from dsfit.experiment.checking import work_of
+
+        return work_of(config, first=first)
+    if config.kind == "race":
+        from dsfit.experiment.race import work_of as races_of
+
+        return races_of(config)
+    if config.kind == "render":
+        from dsfit.experiment.render import work_of as tiles_of
+
+        return tiles_of(config)
+    if config.kind == "compare_render":
+        from dsfit.experiment.compare_render import work_of as techniques_of
+
+        return techniques_of(config)
+    if config.kind in ("transmittance", "amortise"):
+        return [{"context": {}}]
+    return [{"context": context} for context in build.context_values(config.contexts)]
 
 
 _SHOWN_ANYWAY = ("fiber.preset", "contexts.theta_r_deg", "contexts.phi_r_deg", "contexts.n", "contexts.v")
@@ -70,6 +73,11 @@ def _label(config: Config, identity: dict[str, Any]) -> str:
         return f"{identity['suite']}: {identity['part']}"
     if identity.get("peer"):
         return f"{identity['peer']}: {identity['group']}"
+    if identity.get("technique"):
+        return str(identity["technique"])
+    if identity.get("tile"):
+        top, left, bottom, right = identity["tile"]
+        return f"rows {top} to {bottom - 1}, columns {left} to {right - 1}"
     parts = [config.fiber.preset]
     parts += [f"{key.split('.')[-1]} {value}" for key, value in identity["grid"].items() if key not in _SHOWN_ANYWAY]
     context = identity["context"]
@@ -103,6 +111,10 @@ def run_job(directory: RunDirectory, job: Job, say: Callable[[str], None]) -> No
         from dsfit.experiment.compare_render import compare_render
 
         data, arrays = compare_render(job.config, job.identity, directory, say)
+    elif job.config.kind == "render":
+        from dsfit.experiment.render import render
+
+        data, arrays = render(job.config, job.identity, directory, say)
     elif job.config.kind == "amortise":
         from dsfit.experiment.amortise import amortise
 

@@ -19,6 +19,7 @@ from dsfit.experiment.store import save_proposal
 if TYPE_CHECKING:
     from dsfit.bsdf import DualScattering
     from dsfit.experiment.schema import Config
+    from dsfit.experiment.schema_render import Technique
 
 FOLDER = "proposals-cache"
 _TRAINING_CODE = ("bsdf", "fit", "proposals", "scene")
@@ -48,8 +49,8 @@ def cached_proposal(
         folder: of run directories.
 
     Returns:
-        The file, for `dsfit.load_proposal`, and `seconds` (of the training, whenever it was), `steps`, `contexts`, and
-        `found`: whether it was there already.
+        The file, for `dsfit.load_proposal`, and `seconds` (of the training, whenever it was), its `parts`, `steps`,
+        `contexts`, and `found`: whether it was there already.
 
     Raises:
         InputError: an option that `dsfit.amortise` refuses.
@@ -65,7 +66,8 @@ def cached_proposal(
 
     say("training the proposal")
     found = amortise(bsdf, **training)
-    facts = {"seconds": found.seconds, "steps": found.steps, "contexts": found.contexts}
+    spent = {"seconds": found.seconds["total"], "parts": found.seconds}
+    facts = {**spent, "steps": found.steps, "contexts": found.contexts}
     save_proposal(path, found.proposal)
     files.write_json(path.with_suffix(".json"), {"schema_version": SCHEMA_VERSION, **facts})
     return path, {**facts, "found": False}
@@ -74,3 +76,14 @@ def cached_proposal(
 def _facts(path: Path) -> dict[str, Any]:
     facts = files.read_json(path.with_suffix(".json"), SCHEMA_VERSION)
     return {key: value for key, value in facts.items() if key != "schema_version"}
+
+
+def is_trained(technique: Technique) -> bool:
+    """Whether a technique asks for a training before the first tile."""
+    return technique.kind == "amortised" and bool(technique.options.get("train")) and not technique.options.get("file")
+
+
+def with_proposal(technique: Technique, path: Path) -> Technique:
+    """The technique with its trained proposal from a file; what the training took is counted elsewhere."""
+    options = {key: value for key, value in technique.options.items() if key not in ("train", "training")}
+    return technique.model_copy(update={"options": {**options, "file": str(path)}})

@@ -17,7 +17,8 @@ from typing import Any
 from dsfit.experiment.schema import Config
 
 _PACKAGES = (
-    "torch", "numpy", "scipy", "jax", "jaxlib", "optimistix", "OpenEXR", "pydantic", "matplotlib", "emcee", "mpmath",
+    "torch", "numpy", "scipy", "jax", "jaxlib", "optimistix", "OpenEXR", "embreex", "pydantic", "matplotlib", "emcee",
+    "mpmath",
 )  # fmt: skip
 
 
@@ -53,7 +54,8 @@ def code_version() -> str:
 def run_id(config: Config) -> str:
     """Hash of everything that decides the numbers: the resolved config without where it is written, files it reads,
     and the code."""
-    data = config.model_dump(exclude={"output", "title"})
+    shown = {"exposure", "tone_map"}  # change a rendering's PNG, which any run makes anew
+    data = config.model_dump(exclude={"output": True, "title": True, "render": shown})
     for part in (data["light"], *data["light"].get("lights", []), data["geometry"]):
         if path := part.get("path"):
             part["path"] = hashlib.sha256(Path(path).read_bytes()).hexdigest()

@@ -6,6 +6,7 @@ cells/0003.json    numbers of one cell (one context of one grid point); written 
 cells/0003.npz     its maps and raw estimates
 proposals/0003-NAME.npz   its fitted proposals (`dsfit.load_proposal`)
 result.json        everything in one file; written last, so it marks the run as finished
+image.exr  image.png      of a rendering
 table.md  figures/*.png  figures/*.pdf
 images/*.exr  images/*.png   what was rendered
 """

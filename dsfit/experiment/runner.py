@@ -19,7 +19,7 @@ from typing import Any, Protocol
 from dsfit.experiment import check_report, files, provenance
 from dsfit.experiment.cells import Job, jobs, run_job
 from dsfit.experiment.rundir import RunDirectory, RunFailure
-from dsfit.experiment.schema import SCHEMA_VERSION
+from dsfit.experiment.schema import SCHEMA_VERSION, Config
 from dsfit.experiment.validation import Experiment
 
 _ONE_THREAD = {
@@ -107,7 +107,7 @@ def run(
     with directory.lock():
         if force:
             directory.clear()
-        elif (result := directory.finished()) is not None:
+        elif (result := directory.finished()) is not None and _is_whole(directory, experiment.config):
             return Outcome(directory, result, skipped=True)
         started, clock = provenance.now(), time.perf_counter()
         config = experiment.config.model_dump(exclude_none=True)
@@ -126,6 +126,10 @@ def run(
         directory.write_json("provenance.json", {**record, "sessions": sessions})
         progress.start(len(todo), len(done))
         try:
+            if pending and experiment.config.kind == "render":
+                from dsfit.experiment.render import prepare
+
+                prepare(directory, experiment.config, lambda what: progress.step(pending[0].index, what))
             failures = _compute(directory, pending, workers, progress)
         finally:
             session.update(finished=provenance.now(), seconds=round(time.perf_counter() - clock, 3))
@@ -145,8 +149,21 @@ def run(
         }
         if experiment.config.kind == "check":
             result["report"] = check_report.report(result["cells"], experiment.config.check.level)
+        if experiment.config.kind == "render":
+            from dsfit.experiment.render_image import finish
+
+            result["image"] = finish(directory, result, experiment.config)
         directory.write_json("result.json", result)
         return Outcome(directory, {"schema_version": SCHEMA_VERSION, **result}, skipped=False)
+
+
+def _is_whole(directory: RunDirectory, config: Config) -> bool:
+    """Whether a finished run has everything: of a rendering, its image."""
+    if config.kind != "render":
+        return True
+    from dsfit.experiment.render_image import is_whole
+
+    return is_whole(directory, config.render)
 
 
 def _compute(directory: RunDirectory, pending: list[Job], workers: int, progress: Progress) -> list[tuple[Job, str]]:

@@ -46,6 +46,11 @@ def _figures(directory: RunDirectory, result: dict[str, Any]) -> Iterator[tuple[
 
         yield "amortised", amortise(directory, result)
         return
+    if result["kind"] == "render":
+        from dsfit.experiment.plots.render import render
+
+        yield from render(directory)
+        return
     yield "convergence", convergence(result)
     yield "excess", excess_bars(result)
     if result["kind"] == "sweep" and (grid := excess_grid(result)) is not None:

@@ -57,16 +57,18 @@ def look(index: int) -> dict[str, Any]:
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     """Write `name.png` and `name.pdf` atomically; returns the two paths."""
-    paths = []
     _plain(figure)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # laid out once, not once more for every format
-    for kind in ("png", "pdf"):
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format=kind)
-        write_bytes(folder / f"{name}.{kind}", buffer.getvalue())
-        paths.append(folder / f"{name}.{kind}")
-    return paths
+    return [write_figure(figure, folder / f"{name}.{kind}") for kind in ("png", "pdf")]
+
+
+def write_figure(figure: Figure, path: Path) -> Path:
+    """Write the figure atomically in the format that the name ends with."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=path.suffix.removeprefix("."))
+    write_bytes(path, buffer.getvalue())
+    return path
 
 
 def _plain(figure: Figure) -> None:
