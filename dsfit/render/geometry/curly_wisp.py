@@ -79,6 +79,7 @@ def curly_wisp(
     helix = torch.stack([size * turn.cos(), torch.zeros_like(turn), size * turn.sin()], -1)
     # within the ringlet strands lie side by side in a band
     band = 0.14 * curl * normal((strands, 1, 3), generator) * (1.0 - 0.5 * s[:, None])
+    band[..., 1] *= smoothstep(s, 0.0, 0.2)  # roots all at one height
     loose = 0.03 * curl * wander(strands, points, turns / 2, generator) * torch.where(stray, 7.0, 1.0)[..., None]
     return to_strands(axis + helix + band + loose, radius, generator, tip=0.25)
 
