@@ -45,6 +45,7 @@ def compare_render(
     """Numbers and arrays of one cell. A technique that fails says why and leaves the others alone."""
     reference, facts = _reference(config, directory, say)
     if identity["technique"] == REFERENCE:
+        _write(config, directory, REFERENCE, reference, reference)
         return {"technique": REFERENCE, "reference": facts}, _arrays(reference)
     technique = next(t for t in config.compare.techniques if t.name == identity["technique"])
     data = {"technique": technique.name, **technique.model_dump(exclude={"name"})}
@@ -201,13 +202,16 @@ class _Cell:
         image = brush.image(radiance, None, samples)
         row = self._row(samples, seconds, brush, radiance)
         flip = hdr_flip(image, self.reference)
-        folder = self.directory.path / "images"
-        folder.mkdir(parents=True, exist_ok=True)
         stem = f"{name}-{slug(technique)}"
-        write_image(folder / f"{stem}.exr", image)
-        tone = tone_map(self.config, self.reference)
-        write_png(folder / f"{stem}.png", tone(image.radiance))
+        _write(self.config, self.directory, stem, image, self.reference)
         return {**row, "flip": flip.covered, "flip_of_reference": flip.of_reference, "file": f"images/{stem}.exr"}
+
+
+def _write(config: Config, directory: RunDirectory, stem: str, image: RenderImage, reference: RenderImage) -> None:
+    folder = directory.path / "images"
+    folder.mkdir(parents=True, exist_ok=True)
+    write_image(folder / f"{stem}.exr", image)
+    write_png(folder / f"{stem}.png", tone_map(config, reference)(image.radiance))
 
 
 def tone_map(config: Config, reference: RenderImage) -> ToneMap:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,20 +20,18 @@ from dsfit.experiment.render_scene import key_of, scene_of
 from dsfit.experiment.schema import Config
 from dsfit.experiment.schema_render import Technique
 from dsfit.race.clock import children_seconds, timed
-from dsfit.random import child
 from dsfit.render.hits import HitContext, Hits
 from dsfit.render.images import RenderImage
+from dsfit.render.integrator import estimate, groups
 from dsfit.render.scene import RenderScene
 from dsfit.render.techniques import technique as make_technique
 
-_HITS = 2**14
-"""About how many hits are worked on at once."""
 _FEW = 16
 
 
 @dataclass(frozen=True)
 class Part:
-    """Neighbouring rows of the image: their hits, contexts, and the number of each hit's pixel in the image."""
+    """Neighbouring pixels of the image: their hits, contexts, and the number of each hit's pixel in the image."""
 
     hits: Hits
     contexts: HitContext
@@ -115,13 +114,11 @@ def _picture(_key: Any, carried: _Carried) -> Picture:
     return Picture(scene, parts, coverage, n, torch.nan_to_num(depth), facts)
 
 
-def _parts(scene: RenderScene) -> Any:
-    height, width = scene.camera.height, scene.camera.width
-    rows = max(1, _HITS // (width * scene.subsamples))
-    for top in range(0, height, rows):
-        hits = scene.hits(range(top, min(top + rows, height)), range(width))
-        if len(hits):
-            yield Part(hits, scene.contexts(hits), hits.pixel + top * width)
+def _parts(scene: RenderScene) -> Iterator[Part]:
+    hits = scene.hits(range(scene.camera.height), range(scene.camera.width))
+    for some in groups(hits.pixel):
+        part = hits[some]
+        yield Part(part, scene.contexts(part), part.pixel)
 
 
 @torch.no_grad()
@@ -159,22 +156,21 @@ class Painter:
         part = self.picture.parts[len(self.picture.parts) // 2]
         with torch.no_grad():
             self.least = self.technique.at(part.hits, part.contexts, part.pixel).least
-        twice = [timed(lambda: self._part(part, max(self.least, 2), torch.Generator()))[1] for _ in range(2)]
+        twice = [timed(lambda: self._part(part, max(self.least, _FEW), 0))[1] for _ in range(2)]
         first = max(0.0, twice[0] - twice[1]) + children_seconds() - compilers
         self.preparation = {"seconds": prepare + first, "prepare": prepare, "first_use": first}
 
-    @torch.no_grad()
-    def _part(self, part: Part, samples: int, generator: torch.Generator) -> Tensor:
+    def _part(self, part: Part, samples: int, seed: int) -> Tensor:
         sampler = self.technique.at(part.hits, part.contexts, part.pixel)
-        return sampler.estimate(samples, child(generator))
+        return estimate(sampler, self.technique, part.pixel, samples, self.picture.scene.camera.width, seed)
 
     def paint(self, samples: int, seed: int) -> tuple[Tensor, float]:
         """Radiance `[H, W, C]` in float64 from `samples` directions at every hit, and the CPU seconds that took."""
         scene, start = self.picture.scene, time.process_time()
         total = torch.zeros(scene.camera.height * scene.camera.width, scene.channels, dtype=torch.float64)
         for part in self.picture.parts:
-            value = self._part(part, samples, torch.Generator().manual_seed(seed))
-            total.index_add_(0, part.pixel, value.to(torch.float64).expand(-1, scene.channels))
+            value = self._part(part, samples, seed)
+            total.index_add_(0, part.pixel, value.expand(-1, scene.channels))
         radiance = total.reshape(scene.camera.height, scene.camera.width, -1) / scene.subsamples
         radiance += (1 - self.picture.coverage).unsqueeze(-1) * scene.background
         return radiance, time.process_time() - start

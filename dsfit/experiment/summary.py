@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import RenderableType
 from rich.table import Table
 
-from dsfit.experiment import amortise_report, check_report, race_report, render_report
+from dsfit.experiment import amortise_report, check_report, compare_render_report, race_report, render_report
 from dsfit.experiment.files import number
 
 
@@ -148,6 +148,8 @@ def terminal_table(result: dict[str, Any]) -> RenderableType:
         return race_report.terminal_table(result)
     if result["kind"] == "amortise":
         return amortise_report.terminal_table(result)
+    if result["kind"] == "compare_render":
+        return compare_render_report.terminal_table(result)
     if result["kind"] == "render":
         return render_report.terminal_table(result)
     if result["kind"] == "transmittance":
@@ -196,6 +198,8 @@ def markdown(result: dict[str, Any]) -> str:
         return race_report.markdown(result)
     if result["kind"] == "amortise":
         return amortise_report.markdown(result)
+    if result["kind"] == "compare_render":
+        return compare_render_report.markdown(result)
     if result["kind"] == "render":
         return render_report.markdown(result)
     if result["kind"] == "transmittance":

@@ -51,6 +51,13 @@ def _figures(directory: RunDirectory, result: dict[str, Any]) -> Iterator[tuple[
 
         yield from render(directory)
         return
+    if result["kind"] == "compare_render":
+        from dsfit.experiment.plots.compare_render import compare_curves
+        from dsfit.experiment.plots.compare_render_pictures import compare_pictures
+
+        yield "curves", compare_curves(result)
+        yield from compare_pictures(directory, result)
+        return
     yield "convergence", convergence(result)
     yield "excess", excess_bars(result)
     if result["kind"] == "sweep" and (grid := excess_grid(result)) is not None:
