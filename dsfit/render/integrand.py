@@ -89,7 +89,7 @@ class HairIntegrand(Integrand):
             directions = omega_i.expand(*shape, 2).reshape(-1, 2)[index]
             light = radiance.expand(*shape, -1).reshape(-1, radiance.shape[-1])[index]
             value[index] = (self._shaded(directions, lit) * light).to(value)
-        return value.reshape(*shape, -1)
+        return value.reshape(*shape, self.channels)
 
     def _shaded(self, omega_i: Tensor, context: Context) -> Tensor:
         """F cos(theta_i) `[..., C]`."""
@@ -101,7 +101,7 @@ class HairIntegrand(Integrand):
             return self.bsdf(theta_i, context.theta_r, phi, n, v, phi_h=self._phi_h(context, phi))
         given = context.theta_r, n, v, theta_i, context.phi_r - phi_i
         flat = [x.expand(n.shape).reshape(-1).to(torch.float32) for x in given]
-        return self.kernel.eval_each(*flat).reshape(*n.shape, -1).to(omega_i.dtype)
+        return self.kernel.eval_each(*flat).reshape(*n.shape, self.bsdf.channels).to(omega_i.dtype)
 
     def theta_breaks(self, context: Context) -> Tensor:
         return self._one(context).theta_breaks(context)

@@ -89,14 +89,9 @@ class RenderScene:
         """Number of channels C."""
         return len(self.background)
 
-    @functools.cached_property
+    @property
     def _kernel(self) -> HairKernel | str:
-        from dsfit.kernels import HairKernel
-
-        try:
-            return HairKernel(self.bsdf)
-        except InputError as error:
-            return f"torch: {error}"
+        return kernel_of(self.bsdf)
 
     @property
     def kernel(self) -> HairKernel | None:
@@ -161,6 +156,17 @@ class RenderScene:
         """The integrand at these hits; `exact`: without the kernel."""
         kernel = None if exact else self.kernel
         return HairIntegrand(self.bsdf, self.light, self.scattering(hits), hits, kernel)
+
+
+@functools.lru_cache(maxsize=4)
+def kernel_of(bsdf: DualScattering) -> HairKernel | str:
+    """The kernel of a BSDF with the mixture as it starts, made once; or why there is none."""
+    from dsfit.kernels import HairKernel
+
+    try:
+        return HairKernel(bsdf)
+    except InputError as error:
+        return f"torch: {error}"
 
 
 def _cast(hits: Hits, dtype: torch.dtype) -> Hits:

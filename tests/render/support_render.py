@@ -37,7 +37,7 @@ class HandMade:
         pixel = (row - rows.start) * len(columns) + column - columns.start
         row, column, sample, pixel = (x.reshape(-1) for x in (row, column, sample, pixel))
         key = (row * 131 + column * 17 + sample * 5 + seed).double()
-        kept = torch.ones_like(row, dtype=torch.bool) if self.all_rays else (column > 0) & (key % 5 != 1)
+        kept = torch.ones_like(row, dtype=torch.bool) if self.all_rays else (column > 0) & ((key + 3 * sample) % 5 != 1)
         row, column, sample, pixel, key = (x[kept] for x in (row, column, sample, pixel, key))
         turn, tilt = 0.9 * key, 1.2 * torch.sin(0.7 * key)
         flat = torch.cos(tilt)
@@ -75,5 +75,5 @@ def narrow_light(kappa: float = 200.0) -> Any:
     """A small bright source and a dim sky."""
     from dsfit.scene.lights import VonMisesFisherLights
 
-    direction = torch.tensor([[math.sin(0.6), 0.5, math.cos(0.6)]])
+    direction = torch.tensor([[math.sin(0.6), 0.5, math.cos(0.6)]], dtype=torch.float64)
     return VonMisesFisherLights(direction, kappa, 3.0, ambient=0.1)

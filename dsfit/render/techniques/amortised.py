@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 
@@ -14,6 +14,9 @@ from dsfit.proposals.base import Proposal
 from dsfit.race.density import DensitySampler
 from dsfit.race.peer import Problem, Sampler
 from dsfit.race.peers import amortised as race
+
+if TYPE_CHECKING:
+    from dsfit.kernels import HairKernel
 
 
 class Amortised(race.Amortised):
@@ -44,20 +47,27 @@ class Amortised(race.Amortised):
         self.given = proposal
 
     def prepare(self, problem: Problem) -> None:
-        """Train, load or take the mixture; then its kernel."""
+        """Train, load or take the mixture; then its kernel, if the fibre has tables."""
         self.problem = problem
-        self.mixture = self._proposal(problem) if self.given is None else self.given
-        self.proposal = self._drawn(problem)
+        self.kernel = self._kernel(problem)
+        self.proposal = self._mixture(problem) if self.kernel is None else self.kernel.proposal()
 
-    def _drawn(self, problem: Problem) -> Proposal:
+    def _kernel(self, problem: Problem) -> HairKernel | None:
         from dsfit.kernels import HairKernel
+        from dsfit.render.scene import kernel_of
 
-        if problem.dtype == torch.float32:
-            try:
-                return HairKernel(problem.model.bsdf, self.mixture).proposal()
-            except InputError:  # a fibre without tables
-                pass
-        return copy.deepcopy(self.mixture).to(problem.dtype)
+        if problem.dtype != torch.float32:
+            return None
+        shared = kernel_of(problem.model.bsdf)
+        if isinstance(shared, str) or not (self.train or self.file or self.training or self.given):
+            return None if isinstance(shared, str) else shared
+        return HairKernel(problem.model.bsdf, self._trained(problem))
+
+    def _mixture(self, problem: Problem) -> Proposal:
+        return copy.deepcopy(self._trained(problem)).to(problem.dtype)
+
+    def _trained(self, problem: Problem) -> Proposal:
+        return self._proposal(problem) if self.given is None else self.given
 
     def at(self, contexts: Context) -> Sampler:
         """The mixtures of these hits."""
