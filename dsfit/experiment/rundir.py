@@ -27,7 +27,10 @@ from dsfit.errors import InputError
 from dsfit.experiment import files
 from dsfit.experiment.schema import SCHEMA_VERSION
 
-_OWN = ("config.toml", "provenance.json", "result.json", "table.md", "cells", "proposals", "figures", "images")
+_OWN = (
+    "config.toml", "provenance.json", "result.json", "table.md", "image.exr", "image.png", "cells", "proposals",
+    "figures", "images",
+)  # fmt: skip
 
 
 class RunFailure(RuntimeError):

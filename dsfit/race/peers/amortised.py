@@ -27,7 +27,7 @@ class Amortised(Peer):
         training: keyword arguments of `dsfit.amortise` (`seconds`, `steps`, `hidden`, `defensive`).
 
     Raises:
-        InputError: a file without its seconds, or the seconds without a file.
+        InputError: a file without its seconds, or the seconds without a file; `training` that is no table.
     """
 
     name: ClassVar[str] = "amortised"
@@ -43,6 +43,8 @@ class Amortised(Peer):
             raise InputError(f"{self.name}.file_seconds", file_seconds, "the seconds of training of `file`, with it")
         self.train, self.file = bool(train), file
         self.file_seconds = 0.0 if file_seconds is None else as_number(f"{self.name}.file_seconds", file_seconds, 0.0)
+        if training is not None and not isinstance(training, dict):
+            raise InputError(f"{self.name}.training", training, "keyword arguments of dsfit.amortise")
         self.training = dict(training or {})
 
     def prepare(self, problem: Problem) -> None:
