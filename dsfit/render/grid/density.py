@@ -90,9 +90,9 @@ class DensityGrid:
         low, high = (x.to(torch.float64) for x in strands.bounds)
         extent = high - low
         voxel = float(extent.max()) / resolution
-        counts = torch.ceil(extent / voxel - 1e-9).clamp(1, resolution).long()
+        counts = torch.ceil(extent / voxel - 1e-9).clamp(1, resolution)
         corner = (low + high - counts * voxel) / 2
-        x, y, z = counts.tolist()
+        x, y, z = (int(count) for count in counts)
         return cls(deposit(strands, corner, voxel, (x, y, z)), corner, voxel, **options)
 
     @property

@@ -49,7 +49,7 @@ def _march(grid: DensityGrid, field: Tensor, origin: Tensor, direction: Tensor) 
     steps = torch.ceil((leave - enter).detach() / grid.step).long()
     ray = torch.arange(len(steps)).repeat_interleave(steps)
     turn = torch.arange(len(ray)) - (steps.cumsum(0) - steps)[ray]
-    t = enter[ray] + (turn + 0.5) * grid.step
+    t = enter[ray] + (turn.to(enter) + 0.5) * grid.step
     place = start[ray] + t[:, None] * d[ray]
     # The field is zero at the border and beyond: the last step, which may reach past it, adds nothing there.
     place = torch.minimum(place.clamp_min(0.0), top)

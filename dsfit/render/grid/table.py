@@ -90,7 +90,7 @@ class DirectionalTable:
         check_finite("position", position)
         transmitted, share = self._representative(v)
         n, lit = (self._between(x.unsqueeze(-1), position).squeeze(-1).to(position) for x in (transmitted, share))
-        return n, lit
+        return n, torch.where(n == 0, 1.0, lit.clamp(0.0, 1.0))
 
     def _representative(self, v: Any) -> tuple[Tensor, Tensor]:
         """The two fields `[X, Y, Z]`."""
@@ -98,6 +98,7 @@ class DirectionalTable:
 
         n = self.n.flatten(-2).to(torch.float64)
         transmitted = (math.log(n.shape[-1]) - torch.logsumexp(-n, dim=-1)).clamp_min(0.0)
+        transmitted = torch.where((n == 0).all(-1), 0.0, transmitted)
         if isinstance(v, str):
             check_choice("v", v, ("poisson", "threshold"))
             share = torch.exp(-transmitted) if v == "poisson" else (n <= THRESHOLD).double().mean(-1)
