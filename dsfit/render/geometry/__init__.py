@@ -12,6 +12,8 @@ from dsfit.render.geometry.ball import ball
 from dsfit.render.geometry.block import block
 from dsfit.render.geometry.curly_wisp import curly_wisp
 from dsfit.render.geometry.double_block import double_block
+from dsfit.render.geometry.hair_file import read_hair, write_hair
+from dsfit.render.geometry.pbrt_file import read_pbrt_curves
 from dsfit.render.geometry.straight_bundle import straight_bundle
 from dsfit.render.geometry.transform import (
     fitted_into,
@@ -45,6 +47,8 @@ __all__ = [
     "double_block",
     "fitted_into",
     "joined",
+    "read_hair",
+    "read_pbrt_curves",
     "scaled",
     "straight_bundle",
     "subsampled",
@@ -53,4 +57,5 @@ __all__ = [
     "turned_up",
     "wavy_bundle",
     "with_radius",
+    "write_hair",
 ]
