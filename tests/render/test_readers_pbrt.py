@@ -93,6 +93,17 @@ def test_consecutive_curves_that_touch_are_one_strand(tmp_path: Path) -> None:
     assert moved.first.tolist() == [0, 5]  # joined in the world, not in the file's numbers
 
 
+def test_windows_of_a_bspline_are_one_strand(tmp_path: Path) -> None:
+    """Exporters write a strand as one curve per span, each with three control points of the one before."""
+    control = np.random.default_rng(0).normal(size=(7, 3)).cumsum(0)
+    basis = '"string basis" "bspline" "float width" 0.1'
+    windows = "".join(curve(control[k : k + 4], basis) for k in range(4))
+    one, parts = (read(tmp_path / "a.pbrt", text) for text in (curve(control, basis), windows))
+    assert len(parts) == 1
+    assert torch.allclose(parts.points, one.points, atol=1e-13)
+    assert torch.allclose(parts.radius, one.radius)
+
+
 @pytest.mark.parametrize(
     ("steps", "expected"),
     [

@@ -21,6 +21,8 @@ from dsfit.render.strands import Strands
 _HEADER = struct.Struct("<4sIIIIff3f88s")
 _SEGMENTS, _POINTS, _THICKNESS, _TRANSPARENCY, _COLOUR = (1 << bit for bit in range(5))
 _MOST_SEGMENTS = 2**16 - 1
+_MOST_POINTS = 200_000_000
+"""Largest file that is read: 2.4 GB of points, which become 6.4 GB of float64."""
 _ALLOWED = "a .hair file"
 
 
@@ -56,6 +58,8 @@ def _read(path: str | Path, file: BinaryIO, size: int) -> Strands:
         raise InputError(f"{path}: bit array", bin(arrays), "bits 0 to 4, bit 1 (points) set")
     if strands < 1:
         raise InputError(f"{path}: number of strands", strands, "at least 1")
+    if points > _MOST_POINTS:
+        raise InputError(f"{path}: number of points", points, f"at most {_MOST_POINTS}")
     listed = bool(arrays & _SEGMENTS)
     if not listed and not 1 <= segments <= points:
         raise InputError(f"{path}: default number of segments", segments, "1 or more, where strands do not list theirs")
