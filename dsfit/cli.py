@@ -1,5 +1,5 @@
 """The command line: `dsfit run CONFIG`, `dsfit check CONFIG`, `dsfit bench CONFIG`, `dsfit render CONFIG`,
-`dsfit compare-images A.exr REF.exr`, `dsfit plan CONFIG`, `dsfit show RUNDIR`, `dsfit presets`.
+`dsfit compare-images A.exr REF.exr`, `dsfit plan CONFIG`, `dsfit export CONFIG`, `dsfit show RUNDIR`, `dsfit presets`.
 
 Exit codes: 0 done, 1 the run failed (what is done is kept), 2 the config or an argument is wrong (nothing was
 written), 3 a check was not passed, 130 interrupted.
@@ -154,6 +154,38 @@ def plan(config: Config, set_: Changes = None) -> None:
             _console().print(f"{heading}: {found}", soft_wrap=True)
     except InputError as error:
         _fail(f"config error\n{error}", 2)
+
+
+@app.command()
+def export(
+    source: Annotated[Path, typer.Argument(help="TOML file, or a proposal that dsfit.save_proposal wrote (.npz).")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The header that is written.")] = Path("hair.h"),
+    set_: Changes = None,
+    proposal: Annotated[
+        Path | None, typer.Option(help="Take this saved proposal of the config's fibre instead of training one.")
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(min=0, help="Steps of training, instead of [amortise]; 0: the closed-form start.")
+    ] = None,
+    namespace: Annotated[str, typer.Option(help="C++ namespace of the header.")] = "hair",
+    example: Annotated[
+        Path | None, typer.Option(help="Also write a program that integrates the sampler to known albedos.")
+    ] = None,
+    benchmark: Annotated[
+        bool, typer.Option("--benchmark", help="Time the header beside the compiled kernel; needs a C++ compiler.")
+    ] = False,
+) -> None:
+    """Write the fitted sampler and its BSDF as one C++ header without dependencies."""
+    from dsfit.errors import InputError
+    from dsfit.export import command
+
+    try:
+        for line in command.export(source, out, set_ or [], proposal, steps, namespace, example, benchmark):
+            _console().print(line, soft_wrap=True)
+    except InputError as error:
+        _fail(str(error), 2)
+    except (OSError, RuntimeError) as error:
+        _fail(f"export failed: {error}", 1)
 
 
 @app.command()
