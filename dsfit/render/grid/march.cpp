@@ -30,19 +30,27 @@ INLINE float total(V x) {
     return part[0];
 }
 
-// The components of eight pairs of samples: rows[s] holds sample s in its lower half and s + 8 in its upper one.
+#if defined(__clang__)
+#define PICK(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else
+#define PICK(a, b, ...) __builtin_shuffle(a, b, I{__VA_ARGS__})
+#endif
+
+// Eight vectors of eight components of two samples each, turned into a vector of sixteen samples for each component.
 INLINE void turn(V* rows) {
-    const I even = {0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30};
-    const I odd = {1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31};
-    const I even2 = {0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29};
-    const I odd2 = {2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31};
-    const I even4 = {0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27};
-    const I odd4 = {4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31};
-#define SWAP(i, j, e, o) { V a = rows[i], b = rows[j]; rows[i] = __builtin_shuffle(a, b, e); rows[j] = __builtin_shuffle(a, b, o); }
-    SWAP(0, 1, even, odd) SWAP(2, 3, even, odd) SWAP(4, 5, even, odd) SWAP(6, 7, even, odd)
-    SWAP(0, 2, even2, odd2) SWAP(1, 3, even2, odd2) SWAP(4, 6, even2, odd2) SWAP(5, 7, even2, odd2)
-    SWAP(0, 4, even4, odd4) SWAP(1, 5, even4, odd4) SWAP(2, 6, even4, odd4) SWAP(3, 7, even4, odd4)
-#undef SWAP
+#define SWAP(i, j, even, odd) { V a = rows[i], b = rows[j]; rows[i] = PICK(a, b, even); rows[j] = PICK(a, b, odd); }
+#define ONES(i, j) SWAP(i, j, EVEN1, ODD1)
+#define TWOS(i, j) SWAP(i, j, EVEN2, ODD2)
+#define FOURS(i, j) SWAP(i, j, EVEN4, ODD4)
+#define EVEN1 0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30
+#define ODD1 1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31
+#define EVEN2 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29
+#define ODD2 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31
+#define EVEN4 0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27
+#define ODD4 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31
+    ONES(0, 1) ONES(2, 3) ONES(4, 5) ONES(6, 7)
+    TWOS(0, 2) TWOS(1, 3) TWOS(4, 6) TWOS(5, 7)
+    FOURS(0, 4) FOURS(1, 5) FOURS(2, 6) FOURS(3, 7)
 }
 
 struct Ray { float start[3], d[3], enter, leave; };
@@ -72,6 +80,15 @@ INLINE Ray ray_of(const Field& f, const float* origin, const float* direction) {
     return r;
 }
 
+// Eight samples: interpolated in x and y, with both neighbours in z.
+INLINE void interpolate(const Field& f, V* sample, int from, const int32_t* at, const float (*w)[W], int32_t slab,
+                        int32_t row) {
+    for (int s = from; s < from + 8; s++) {
+        const float* p = f.moments + at[s];
+        sample[s] = w[0][s] * load(p) + w[1][s] * load(p + row) + w[2][s] * load(p + slab) + w[3][s] * load(p + slab + row);
+    }
+}
+
 INLINE float march(const Field& f, const Ray& r) {
     if (!(r.leave > r.enter)) return 0;
     const float x = r.d[0], y = r.d[1], z = r.d[2];
@@ -90,23 +107,22 @@ INLINE float march(const Field& f, const Ray& r) {
             part[a] = place - __builtin_convertvector(cell[a], V);
         }
         alignas(64) int32_t at[W];
-        alignas(64) float w00[W], w01[W], w10[W], w11[W], up[W];
+        alignas(64) float weights[4][W];  // of the neighbours in x and y
         I index = cell[0] * slab + cell[1] * row + cell[2] * 8;
-        V w = part[0] * part[1];
-        std::memcpy(at, &index, 64);
-        V v11 = w, v10 = part[0] - w, v01 = part[1] - w, v00 = 1.0f - part[0] - part[1] + w;
-        std::memcpy(w11, &v11, 64); std::memcpy(w10, &v10, 64); std::memcpy(w01, &v01, 64); std::memcpy(w00, &v00, 64);
-        std::memcpy(up, &part[2], 64);
+        V both = part[0] * part[1];
+        V shares[4] = {1.0f - part[0] - part[1] + both, part[1] - both, part[0] - both, both};
+        std::memcpy(at, &index, sizeof at);
+        std::memcpy(weights, shares, sizeof weights);
         V sample[W];
-#define SAMPLE(from, to) for (int s = from; s < to; s++) { const float* p = f.moments + at[s]; sample[s] = w00[s] * load(p) + w01[s] * load(p + row) + w10[s] * load(p + slab) + w11[s] * load(p + slab + row); }
-        SAMPLE(0, 8)
-        if (steps - first > 8) SAMPLE(8, 16) else for (int s = 8; s < W; s++) sample[s] = V{};
+        const int64_t left = steps - first;
+        interpolate(f, sample, 0, at, weights, slab, row);
+        if (left > 8) interpolate(f, sample, 8, at, weights, slab, row);
+        else for (int s = 8; s < W; s++) sample[s] = V{};
         V rows[8];
-        const I lower = {0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23};
-        const I upper = {8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31};
         for (int s = 0; s < 8; s++) {
-            rows[s] = __builtin_shuffle(sample[s], sample[s + 8], lower);
-            sample[s] = __builtin_shuffle(sample[s], sample[s + 8], upper);
+            V low = PICK(sample[s], sample[s + 8], 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23);
+            sample[s] = PICK(sample[s], sample[s + 8], 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+            rows[s] = low;
         }
         turn(rows);
         turn(sample);
