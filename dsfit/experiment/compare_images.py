@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rich.table import Table
 
@@ -108,4 +110,15 @@ def caption(found: Comparison) -> str:
     ]
     if found.reference.variance is None:
         lines.append("The reference does not state its variance: its own error is in all numbers.")
-    return "\n".join(lines)
+    return "\n".join([*lines, *_kinship(found.image.attributes, found.reference.attributes)])
+
+
+def _kinship(image: Mapping[str, Any], reference: Mapping[str, Any]) -> list[str]:
+    """What the files say about themselves that matters to the numbers."""
+    if "dsfit.run" not in image or "dsfit.run" not in reference:
+        return []
+    if image["dsfit.run"] == reference["dsfit.run"]:
+        return ["Both are of the same run: their noise is the same."]
+    if any(image.get(key) != reference.get(key) for key in ("dsfit.seed", "dsfit.subsamples")):
+        return ["Seeds or rays per pixel differ: the difference of the rays' places is in all numbers, too."]
+    return []

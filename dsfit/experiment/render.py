@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import inspect
+import json
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -114,7 +116,7 @@ def render(
     say(f"tile at row {top}, column {left}")
     tile = render_tile(
         scene, technique, range(top, bottom), range(left, right),
-        samples=asked.samples, passes=asked.passes, seed=asked.seed,
+        samples=asked.samples, passes=asked.passes, seed=direction_seed(config),
     )  # fmt: skip
     data = {
         "tile": identity["tile"],
@@ -127,6 +129,14 @@ def render(
         "peak_memory": peak_memory(),
     }
     return data, {name: getattr(tile, name).numpy() for name in _LAYERS}
+
+
+def direction_seed(config: Config) -> int:
+    """Seed of the random directions: other samples, passes or techniques get independent ones, at the same places of
+    the rays, so that the noise of an image and of its reference has nothing in common."""
+    asked = config.render
+    text = json.dumps([asked.seed, asked.samples, asked.passes, asked.technique.model_dump()], sort_keys=True)
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "little")
 
 
 class _Clock:

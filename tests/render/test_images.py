@@ -73,7 +73,7 @@ def test_the_tone_map_follows_its_formula() -> None:
     shown = ToneMap(2.0, "srgb")(x).flatten().tolist()
     expected = [0, 0, 12.92 * 0.002, *(1.055 * y ** (1 / 2.4) - 0.055 for y in (0.1, 0.36)), 1, 1, 1]
     assert shown == pytest.approx(expected, abs=1e-12)
-    y = 0.36 * (2.51 * 0.36 + 0.03) / (0.36 * (2.43 * 0.36 + 0.59) + 0.14)
+    y = 0.216 * (2.51 * 0.216 + 0.03) / (0.216 * (2.43 * 0.216 + 0.59) + 0.14)
     film = ToneMap(2.0, "filmic")(x).flatten()
     assert float(film[4]) == pytest.approx(1.055 * y ** (1 / 2.4) - 0.055, abs=1e-12)
     assert film[0] == 0 and float(film[-1]) == pytest.approx(1.0, abs=1e-12) and bool((film.diff() >= 0).all())

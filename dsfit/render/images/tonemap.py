@@ -28,13 +28,14 @@ def luminance(radiance: Tensor) -> Tensor:
 class ToneMap:
     """display = transfer(curve(exposure x radiance)), each channel on its own.
 
-    `curve`: "srgb" clips to [0, 1]; "filmic" is x (2.51 x + 0.03) / (x (2.43 x + 0.59) + 0.14), clipped, a fit to the
-    ACES curve (K. Narkowicz, "ACES Filmic Tone Mapping Curve", 2015): contrast at the foot, a soft shoulder.
+    `curve`: "srgb" clips to [0, 1]; "filmic" is y (2.51 y + 0.03) / (y (2.43 y + 0.59) + 0.14) with y = 0.6 x, clipped,
+    a fit to the ACES curve (K. Narkowicz, "ACES Filmic Tone Mapping Curve", 2015), which HDR-FLIP sees through, too:
+    contrast at the foot, a soft shoulder.
     `transfer` is that of sRGB (IEC 61966-2-1): 12.92 y up to y = 0.0031308, 1.055 y^(1/2.4) - 0.055 above.
 
     Args:
         exposure: factor on the radiance, > 0. Left out, 1 over the 99th percentile of the luminance of covered pixels
-            (1 where that is 0), which "srgb" shows as white and "filmic" as 80 % of it.
+            (1 where that is 0), which "srgb" shows as white and "filmic" as 67 % of it (linear).
         curve: "srgb" or "filmic".
 
     Raises:
@@ -76,8 +77,8 @@ class ToneMap:
         exposure = self.fixed(radiance, covered).exposure
         x = (radiance * exposure).clamp(min=0.0)
         if self.curve == "filmic":
-            x = x.clamp(max=1e6)  # white long before; beyond, the squares overflow
-            x = x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)
+            y = 0.6 * x.clamp(max=1e6)  # white long before; beyond, the squares overflow
+            x = y * (2.51 * y + 0.03) / (y * (2.43 * y + 0.59) + 0.14)
         return transfer(x.clamp(max=1.0))
 
     def describe(self) -> str:
