@@ -38,6 +38,9 @@ class Convention:
         average_angle: averages are taken at "theta_in" = theta_i, or at "theta_diff" as the chapter's a_f(theta_d)
             suggests.
         limit_energy: whether a_f and a_b are divided by max(1, a_f + a_b).
+        transmittance: what n fibres on the way of the light do (`dsfit.bsdf.forward`): "power", light meets n of them,
+            which pass on a_f^n and widen by n beta_f^2; "poisson", it meets n on average, and the scattered share is
+            passed on by E[a_f^N | N >= 1].
         simplified_energy: the simplified azimuths (21), (25) carry each lobe's "attenuation" integral, or are
             "printed" bare.
     """
@@ -58,6 +61,7 @@ class Convention:
     average_weight: Literal["incident", "outgoing"] = "incident"
     average_angle: Literal["theta_in", "theta_diff"] = "theta_in"
     limit_energy: bool = True
+    transmittance: Literal["power", "poisson"] = "power"
     simplified_energy: Literal["attenuation", "printed"] = "attenuation"
 
     def __post_init__(self) -> None:

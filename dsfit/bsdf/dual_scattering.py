@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dsfit.arguments import all_finite, check_inside
-from dsfit.bsdf import longitudinal
+from dsfit.bsdf import forward, longitudinal
 from dsfit.bsdf.averages import Averages
 from dsfit.bsdf.azimuthal import (
     ALL_LOBES,
@@ -111,7 +111,8 @@ class DualScattering(FiberAverages):
         """F cos(theta_i), `[..., C]` (eq 4): what multiplies radiance in the integral over d omega_i.
 
         consistent: F = v F_direct + (1 - v) F_scatter, F_direct = f_s + d_b f_back(sigma_b^2),
-        F_scatter = d_f a_f^n (f_s^G + d_b f_back(sigma_b^2 + n beta_f^2)).
+        F_scatter = d_f a_f^n (f_s^G + d_b f_back(sigma_b^2 + n beta_f^2)); with `transmittance="poisson"` the a_f^n and
+        n beta_f^2 of a Poisson number of fibres (`dsfit.bsdf.forward`).
 
         Args:
             theta_i, theta_r: inclinations of light and viewer.
@@ -162,7 +163,7 @@ class DualScattering(FiberAverages):
 
     @one_channel
     def scatter(self, theta_i: Tensor, theta_r: Tensor, phi: Tensor, n: Any, *, phi_h: Tensor | None = None) -> Tensor:
-        """F_scatter = T_f (f_s^G + d_b f_back) (eqs 8, 9), `[..., C]`, with T_f = d_f a_f^n (eq 32); not yet
+        """F_scatter = T_f (f_s^G + d_b f_back) (eqs 8, 9), `[..., C]`, with T_f of `transmittance`; not yet
         multiplied by 1 - v.
         """
         return self._scatter(theta_i, theta_r, phi, n, phi_h, self._averages(theta_i, theta_r))
@@ -252,7 +253,7 @@ class DualScattering(FiberAverages):
 
     @one_channel
     def transmittance(self, theta_in: Tensor, n: Tensor) -> Tensor:
-        """T_f(n, theta_in) = d_f a_f(theta_in)^n (eq 32), `[..., C]`; right for n = 0 and for huge n."""
+        """T_f(n, theta_in) = d_f a_f(theta_in)^n (eq 32) or d_f tau, `[..., C]`; right for n = 0 and for huge n."""
         n = torch.as_tensor(n, dtype=theta_in.dtype, device=theta_in.device)
         return self._transmittance(self.averages(theta_in), n)
 
@@ -286,12 +287,13 @@ class DualScattering(FiberAverages):
         return (factor / cos_inclination(diff) ** 2).unsqueeze(-1)
 
     def _transmittance(self, average: Averages, n: Tensor) -> Tensor:
-        base = average.a_f.clamp_min(torch.finfo(average.a_f.dtype).tiny)  # 0^n has no derivative in n
-        return self.d_f.to(n.dtype) * torch.pow(base, n.unsqueeze(-1))
+        passed = forward.transmittance(average.a_f, n.unsqueeze(-1), self.convention.transmittance)
+        return self.d_f.to(n.dtype) * passed
 
     def _variance_f(self, average: Averages, n: Any, like: Tensor) -> Tensor:
-        """sigma_f^2 = n beta_f^2, `[..., C]`."""
-        return torch.as_tensor(n, dtype=like.dtype, device=like.device).unsqueeze(-1) * average.beta_f**2
+        """sigma_f^2 = n beta_f^2, or what a Poisson number of fibres has for n, `[..., C]`."""
+        n = torch.as_tensor(n, dtype=like.dtype, device=like.device).unsqueeze(-1)
+        return forward.event_count(average.a_f, n, self.convention.transmittance) * average.beta_f**2
 
     def _average_angle(self, theta_i: Tensor, theta_r: Tensor) -> Tensor:
         return theta_i if self.convention.average_angle == "theta_in" else theta_diff(theta_i, theta_r)

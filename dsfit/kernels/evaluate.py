@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from dsfit.bsdf.forward import event_count, log_transmittance
 from dsfit.frame import HALF_PI
 from dsfit.kernels.geometry import Direction, Records, take
 from dsfit.kernels.layout import Layout
@@ -112,8 +113,9 @@ def _scattered(
     The transmittance joins the exponents, so that nothing overflows or is lost for large n.
     """
     total: list[Tensor | float] = [0.0] * layout.channels
-    passed = [fixed.log_density + n * x for x in average[0]]
-    wide = [n * x for x in average[1]]
+    law = "poisson" if layout.poisson else "power"
+    passed = [fixed.log_density + log_transmittance(x, n, law) for x in average[0]]
+    wide = [event_count(torch.exp(x), n, law) * y for x, y in zip(average[0], average[1], strict=True)]
     for p, name in enumerate(("R", "TT", "TRT")):
         if name not in layout.scattered:
             continue

@@ -30,6 +30,7 @@ class Layout:
         channels: channels that are computed.
         direct, scattered: terms of F_direct and F_scatter, among R, TT, TRT, back.
         half_back: whether back scattering stays in |phi| < pi/2.
+        poisson: whether the number of fibres that light meets is Poisson distributed (`dsfit.bsdf.forward`).
         components: numbers of the proposal's components in the mixture.
         back_lobe: whether the proposal has a lobe of back scattering.
         laws: per component of the mixture its law of azimuth: the number of a table, "all" or "back" (uniform).
@@ -43,6 +44,7 @@ class Layout:
     direct: tuple[str, ...]
     scattered: tuple[str, ...]
     half_back: bool
+    poisson: bool
     components: tuple[int, ...]
     back_lobe: bool
     laws: tuple[int | str, ...]

@@ -109,6 +109,28 @@ INLINE void closed_tt(const Direction& d, V sin_half, V cos_half, const float* c
     for (int k = 0; k < CHANNELS; k++) value[k] = common * expo(depth * c[11 + k]);
 }
 
+#if POISSON
+// (1 - e^-x) / x
+INLINE V mean_exponential(V x) {
+    V series = all(1.0f), small = vmin(x, all(1.0f));
+    for (int k = 11; k > 1; k--) series = 1.0f - small * series * (1.0f / k);
+    return x < 1.0f ? series : (1.0f - expo(-x)) * inverse(vmax(x, all(1.0f)));
+}
+#endif
+
+// Log transmittance and count of events of n fibres that pass on exp(log_a) each: forward.py
+INLINE void forward(V log_a, V n, V over_n, V* log_passed, V* events) {
+#if POISSON
+    V a = expo(log_a), gap = log_a > -1.0f ? -log_a * mean_exponential(-log_a) : 1.0f - a;
+    V mean = mean_exponential(n * a);
+    *log_passed = log_a - n * gap + logarithm(mean * over_n);
+    *events = inverse(mean);
+#else
+    *log_passed = n * log_a;
+    *events = n;
+#endif
+}
+
 INLINE V in_back(const Direction& d, V value) { return HALF_BACK ? (d.phi < 1.57079633f ? value : V{}) : value; }
 
 INLINE void evaluate(const Tables& t, const Direction& d, const V* record, V n, V v, V* total) {
@@ -140,9 +162,15 @@ INLINE void evaluate(const Tables& t, const Direction& d, const V* record, V n, 
         for (int k = 0; k < CHANNELS; k++) total[k] *= v;
     }
     if (S_ANY) {
-        V unlit = 1.0f - v;
+        V unlit = 1.0f - v, over_n{};
+#if POISSON
+        over_n = inverse(mean_exponential(n));
+#endif
         for (int k = 0; k < CHANNELS; k++) {
-            V passed = c[3] + n * log_a[k], wide = n * beta2[k], sum{};
+            V passed, events, sum{};
+            forward(log_a[k], n, over_n, &passed, &events);
+            passed += c[3];
+            V wide = events * beta2[k];
             if (S_R) sum += gauss(d.theta_h - alpha[0], variance[0] + wide, passed) * record[O_R_SCATTERED];
             if (S_TT) sum += gauss(d.theta_h - alpha[1], variance[1] + wide, passed) * record[O_TT_SCATTERED + k];
             if (S_TRT) sum += gauss(d.theta_h - alpha[2], variance[2] + wide, passed) * record[O_TRT_SCATTERED + k];

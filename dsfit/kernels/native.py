@@ -67,6 +67,7 @@ def header(layout: Layout) -> str:
         "LAW_COLUMNS": layout.law_columns,
         "GUIDE": GUIDE,
         "HALF_BACK": int(layout.half_back),
+        "POISSON": int(layout.poisson),
         "S_ANY": int(bool(layout.scattered)),
         "BACK_LOBE": int(layout.back_lobe),
     }

@@ -123,6 +123,7 @@ def build_program(kernel: HairKernel, need: str) -> Program:
         direct=() if need == "scattered" else kernel.halves["direct"],
         scattered=() if need == "direct" else kernel.halves["scattered"],
         half_back=bsdf.convention.back_azimuth == "back",
+        poisson=bsdf.convention.transmittance == "poisson",
         components=tuple(components),
         back_lobe="back" in proposal.names,
         laws=tuple(laws),

@@ -12,6 +12,7 @@ from dsfit.bsdf.attenuation import lobe_energies
 from dsfit.bsdf.azimuthal import refractions
 from dsfit.bsdf.breaks import theta_breaks
 from dsfit.bsdf.dual_scattering import DualScattering
+from dsfit.bsdf.forward import event_count, log_transmittance
 from dsfit.frame import HALF_PI, cos_inclination, theta_diff, theta_half
 from dsfit.quadrature import panel_points
 from dsfit.special import log_gauss
@@ -39,8 +40,9 @@ class LobeMoments(torch.nn.Module):
         m(theta_i) = || E_p(theta_diff) M(theta_h) a_f(theta_i)^n || cos^2(theta_i) / cos^2(theta_diff),
 
     with M = g(theta_h - alpha_p; beta_p) and no a_f^n for direct light, and with variance beta_p^2 + n beta_f^2 for
-    scattered light. Of each the table keeps log int m, the mean of theta_h, and log root mean squares below and above
-    it. Bilinear in theta_r and n between rows; log energies go on linearly in n beyond the last.
+    scattered light, or what the convention's transmittance has for a_f^n and n. Of each the table keeps log int m, the
+    mean of theta_h, and log root mean squares below and above it. Bilinear in theta_r and n between rows; log energies
+    go on linearly in n beyond the last.
     """
 
     direct: Tensor
@@ -91,7 +93,9 @@ def _row(bsdf: DualScattering, theta_r: Tensor, back: bool) -> tuple[Tensor, Ten
     behind = _log(around * bsdf.d_b * average.A_b)
     measure = _log(weight * cos_inclination(theta_i) ** 2 / cos_inclination(diff) ** 2)
     n = torch.tensor(_DEPTHS, dtype=torch.float64)[:, None, None]
-    passed, wide = _log(bsdf.d_f) + n * _log(average.a_f), n * average.beta_f**2
+    law = bsdf.convention.transmittance
+    passed = _log(bsdf.d_f) + log_transmittance(_log(average.a_f), n, law)
+    wide = event_count(average.a_f, n, law) * average.beta_f**2
     shift, beta = theta_h[:, None] - fiber.alpha, fiber.beta.expand(len(theta_i), 3)
     near = [e + log_gauss(shift[:, k], beta[:, k])[:, None] for k, e in enumerate(energies)]
     far = [

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from dsfit.bsdf.attenuation import lobe_energies
 from dsfit.bsdf.azimuthal import refractions
 from dsfit.bsdf.dual_scattering import DualScattering
+from dsfit.bsdf.forward import event_count, log_transmittance
 from dsfit.context import Context
 from dsfit.errors import InputError
 from dsfit.frame import HALF_PI, cos_inclination
@@ -60,7 +61,7 @@ class ContextLobes(nn.Module):
     Shares are energies at the specular guess theta_i = 2 alpha_p - theta_r, norms over channels: v E_p of the direct
     lobes, (1 - v) d_f a_f^n E_p of the scattered ones, and of back scattering those of both, (v + (1 - v) d_f a_f^n)
     E_b. Widths are beta_p, sqrt(beta_p^2 + n beta_f^2), and sqrt(sigma_b^2 + s n beta_f^2) with s the share of
-    scattered light in back scattering. Nothing is fitted.
+    scattered light in back scattering; a_f^n and n as the convention's transmittance has them. Nothing is fitted.
 
     Raises:
         InputError: a batch of fibres.
@@ -74,7 +75,7 @@ class ContextLobes(nn.Module):
         if bsdf.fiber.batch_shape:
             raise InputError("bsdf.fiber", tuple(bsdf.fiber.batch_shape), "a single fibre")
         self.table = SpecularTable(bsdf)
-        self.back = bool(bsdf.d_b > 0)
+        self.back, self.law = bool(bsdf.d_b > 0), bsdf.convention.transmittance
         self.log_density = math.log(max(float(bsdf.d_f), _TINY))
         self.register_buffer("alpha", bsdf.fiber.alpha.detach().to(torch.float64))
         self.register_buffer("variance", bsdf.fiber.beta.detach().to(torch.float64) ** 2)
@@ -85,8 +86,9 @@ class ContextLobes(nn.Module):
         with torch.no_grad():
             *own, back, passed, beta2, delta_b, sigma2 = self.table(theta_r)
         lit, unlit = log_share(v), log_share(1 - v)
-        log_passed = self.log_density + n.unsqueeze(-1) * passed
-        wide = n * (torch.softmax(log_passed, dim=-1) * beta2).sum(-1)
+        log_passed = self.log_density + log_transmittance(passed, n.unsqueeze(-1), self.law)
+        events = event_count(torch.exp(passed), n.unsqueeze(-1), self.law)
+        wide = (torch.softmax(log_passed, dim=-1) * events * beta2).sum(-1)
         direct = [lit + log_norm(x) for x in own]
         scattered = [unlit + log_norm(log_passed + x) for x in own]
         near, far = lit + log_norm(back), unlit + log_norm(log_passed + back)

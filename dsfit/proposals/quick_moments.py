@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from dsfit.bsdf.forward import event_count, log_transmittance
 from dsfit.frame import HALF_PI, cos_inclination
 from dsfit.proposals.lobe_moments import _ROWS, LobeMoments, _moments, _part
 from dsfit.proposals.quick_tables import QuickScattering, interpolate
@@ -40,28 +41,33 @@ class QuickMoments(LobeMoments):
             rows = [k for k in range(_ROWS) if k % 2 == 0 or min(k, _ROWS - 1 - k) < _GRAZING]
             theta_r = torch.linspace(-HALF_PI, HALF_PI, _ROWS, dtype=torch.float64)[rows]
             averages = _average_rows(bsdf)
-            parts = [_tabulated(bsdf, averages, x, depths, _SCATTERED) for x in theta_r.split(_ROWS_AT_ONCE)]
+            law = bsdf.convention.transmittance
+            parts = [_tabulated(bsdf, averages, x, depths, _SCATTERED, law) for x in theta_r.split(_ROWS_AT_ONCE)]
             scattered = _filled(torch.cat(parts), rows)
-            direct = _filled(_tabulated(bsdf, averages, theta_r, depths[:1], _DIRECT)[:, 0], rows)
+            # a_f^0 is what direct light is multiplied by
+            direct = _filled(_tabulated(bsdf, averages, theta_r, depths[:1], _DIRECT, "power")[:, 0], rows)
             direct[:, 0] -= torch.log(bsdf.d_f)
         self.register_buffer("direct", direct.contiguous())
         self.register_buffer("scattered", scattered.contiguous())
         self.register_buffer("depths", depths)
 
 
-def _tabulated(bsdf: QuickScattering, averages: Tensor, theta_r: Tensor, depths: Tensor, columns: Columns) -> Tensor:
-    """What `LobeMoments` keeps of every lobe, `[rows, depths, 4, columns]`."""
+def _tabulated(
+    bsdf: QuickScattering, averages: Tensor, theta_r: Tensor, depths: Tensor, columns: Columns, law: str
+) -> Tensor:
+    """What `LobeMoments` keeps of every lobe, `[rows, depths, 4, columns]`, for a law of `dsfit.bsdf.forward`."""
     fiber, grid = bsdf.fiber, (len(theta_r), len(depths))
     found = interpolate(averages, _position(-theta_r)).unflatten(-1, (5, -1)).mean(-1)
-    beta2, delta_b, sigma2 = (found[:, k : k + 1] for k in (1, 3, 4))
+    log_a, beta2, delta_b, sigma2 = (found[:, k : k + 1] for k in (0, 1, 3, 4))
     center = torch.cat([fiber.alpha.to(theta_r).expand(len(theta_r), 3), delta_b], dim=-1)[:, None]
     own = torch.cat([(fiber.beta.to(theta_r) ** 2).expand(len(theta_r), 3), sigma2], dim=-1)[:, None]
-    width = torch.sqrt(own + depths[:, None] * beta2[:, None])
+    events = event_count(torch.exp(log_a[:, None]), depths[:, None], law)
+    width = torch.sqrt(own + events * beta2[:, None])
     center, width = (x.expand(*grid, 4)[..., [p for p, _ in columns]] for x in (center, width))
     for nodes in _NODES:
         low, high = _reached(center, width, theta_r)
         theta_h, weight = _gauss(low, high, nodes)
-        log_mass = _log_mass(bsdf, averages, theta_h, weight, theta_r, depths, columns)
+        log_mass = _log_mass(bsdf, averages, theta_h, weight, theta_r, depths, columns, law)
         share = torch.softmax(log_mass, dim=-1)
         center = (share * theta_h).sum(-1)
         width = torch.sqrt((share * (theta_h - center[..., None]) ** 2).sum(-1)).clamp_min(1e-3)
@@ -101,14 +107,21 @@ def _log_mass(
     theta_r: Tensor,
     depths: Tensor,
     columns: Columns,
+    law: str,
 ) -> Tensor:
     """Log of every lobe's marginal times weight, in units of theta_i."""
-    value = _log_marginals(bsdf, averages, theta_h, theta_r[:, None, None, None], depths, columns)
+    value = _log_marginals(bsdf, averages, theta_h, theta_r[:, None, None, None], depths, columns, law)
     return value + torch.log(2 * weight.clamp_min(_TINY))
 
 
 def _log_marginals(
-    bsdf: QuickScattering, averages: Tensor, theta_h: Tensor, theta_r: Tensor, depths: Tensor, columns: Columns
+    bsdf: QuickScattering,
+    averages: Tensor,
+    theta_h: Tensor,
+    theta_r: Tensor,
+    depths: Tensor,
+    columns: Columns,
+    law: str,
 ) -> Tensor:
     """Log of the norm over channels of every lobe's marginal at theta_h `[rows, depths, columns, nodes]`."""
     fiber = bsdf.fiber
@@ -118,7 +131,8 @@ def _log_marginals(
     n = depths[:, None, None, None]
     position, channels = _position(theta_in), bsdf.channels
     log_a, beta2 = interpolate(averages[:, : 2 * channels], position).split(channels, dim=-1)
-    passed, wide = torch.log(bsdf.d_f.clamp_min(_TINY)) + n * log_a, n * beta2
+    passed = torch.log(bsdf.d_f.clamp_min(_TINY)) + log_transmittance(log_a, n, law)
+    wide = event_count(torch.exp(log_a), n, law) * beta2
     parts = []
     for k, (p, side) in enumerate(columns):
         here = (slice(None), slice(None), slice(k, k + 1))

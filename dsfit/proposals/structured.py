@@ -13,6 +13,7 @@ from dsfit.bsdf.attenuation import lobe_energies
 from dsfit.bsdf.azimuthal import refractions
 from dsfit.bsdf.breaks import theta_breaks
 from dsfit.bsdf.dual_scattering import DualScattering
+from dsfit.bsdf.forward import event_count, log_transmittance
 from dsfit.context import Context
 from dsfit.frame import cos_inclination, theta_diff, theta_half
 from dsfit.proposals.base import Azimuthal, Product, Proposal
@@ -94,9 +95,10 @@ class _Start:
         theta_r = context.theta_r[:, None]
         self.theta_h, self.diff = theta_half(self.theta_i, theta_r), theta_diff(self.theta_i, theta_r)
         self.average = bsdf.averages(self.theta_i)
-        self.v, n = context.v[:, None, None], context.n[:, None, None]
-        self.variance_f = n * self.average.beta_f**2
-        self.passed = bsdf.d_f * torch.exp(n * torch.log(self.average.a_f.clamp_min(1e-300)))
+        self.v, n, law = context.v[:, None, None], context.n[:, None, None], bsdf.convention.transmittance
+        self.variance_f = event_count(self.average.a_f, n, law) * self.average.beta_f**2
+        log_a_f = torch.log(self.average.a_f.clamp_min(1e-300))
+        self.passed = bsdf.d_f * torch.exp(log_transmittance(log_a_f, n, law))
 
     def components(self) -> list[tuple[str, float, Proposal]]:
         """Name, energy and proposal of every component that the contexts need."""

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 
+from dsfit.errors import InputError
 from dsfit.experiment import build
 from dsfit.experiment.reader import RawConfig
 from dsfit.experiment.schema import Config
@@ -39,6 +40,10 @@ def test_conventions() -> None:
     assert build.convention(config(bsdf={"convention": "printed"})).lobe_norm == "printed"
     mixed = build.convention(config(bsdf={"convention": {"base": "printed", "density_power": 1}}))
     assert mixed.lobe_norm == "printed" and mixed.density_power == 1
+    poisson = build.convention(config(bsdf={"convention": {"base": "consistent", "transmittance": "poisson"}}))
+    assert poisson.transmittance == "poisson" and poisson.share == "complement"
+    with pytest.raises(InputError, match="transmittance: got 'binomial'; allowed: one of 'power', 'poisson'"):
+        build.convention(config(bsdf={"convention": {"base": "consistent", "transmittance": "binomial"}}))
 
 
 def test_contexts_are_products_or_zipped() -> None:

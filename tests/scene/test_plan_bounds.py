@@ -83,6 +83,14 @@ def test_every_term_is_between_its_bounds(seed: int) -> None:
     assert violations(bounds_of(bsdf, context), direct_and_means(bsdf, context)) == []
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_every_term_is_between_its_bounds_for_a_poisson_number_of_fibres(seed: int) -> None:
+    g = torch.Generator().manual_seed(40 + seed)
+    bsdf, context = random_bsdf(g), random_context(g)
+    bsdf = bsdf.replace(convention=dsfit.Convention.named(bsdf.convention, transmittance="poisson"))
+    assert violations(bounds_of(bsdf, context), direct_and_means(bsdf, context)) == []
+
+
 def direct_and_means(bsdf: dsfit.DualScattering, context: dsfit.Context) -> Tensor:
     """Integral of every term by one-dimensional quadrature over theta_i: azimuths integrated as energies.
 
@@ -117,8 +125,11 @@ def direct_and_means(bsdf: dsfit.DualScattering, context: dsfit.Context) -> Tens
     energies = energies[row] * (1 - part) + energies[row + 1] * part
     average = bsdf.averages(theta_i)
     n, v = context.n, context.v
-    passed = bsdf.d_f**convention.density_power * torch.exp(n * torch.log(average.a_f.clamp_min(1e-300)))
-    spread = n * average.beta_f**2
+    if convention.transmittance == "poisson":
+        passed, spread = poisson_sums(average.a_f, n)
+    else:
+        passed, spread = torch.exp(n * torch.log(average.a_f.clamp_min(1e-300))), n
+    passed, spread = bsdf.d_f**convention.density_power * passed, spread * average.beta_f**2
     back = 2 * math.pi if convention.back_azimuth == "all" else math.pi
     back = 2 * back / math.pi * bsdf.d_b * average.A_b
     pi = math.pi if convention.back_factor == "pi" else 1.0
@@ -133,6 +144,14 @@ def direct_and_means(bsdf: dsfit.DualScattering, context: dsfit.Context) -> Tens
         rows.append((1 - v) * passed * lobe * energies[:, k])
     rows.append((1 - v) * passed * pi * back * torch.exp(log_gauss(shifted, torch.sqrt(average.sigma_b**2 + spread))))
     return torch.stack([(row * projection[:, None]).sum(0) for row in rows])
+
+
+def poisson_sums(a_f: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
+    """sum_k P_k a_f^k and sum_k k P_k a_f^k over that, with P_k the Poisson law of mean n given k >= 1."""
+    k = torch.arange(1.0, 200.0, dtype=torch.float64)
+    weight = torch.exp(k * torch.log(n) - torch.lgamma(k + 1) - n) / -torch.expm1(-n) * a_f.unsqueeze(-1) ** k
+    total = weight.sum(-1)
+    return total, (k * weight).sum(-1) / total.clamp_min(1e-300)
 
 
 def _treated_energy(bsdf: dsfit.DualScattering, theta_diff: Tensor) -> Tensor:

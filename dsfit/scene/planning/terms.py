@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dsfit.bsdf.dual_scattering import DualScattering
+from dsfit.bsdf.forward import event_count, log_transmittance
 from dsfit.frame import HALF_PI
 from dsfit.scene.planning.averages import AverageBounds, average_bounds
 from dsfit.scene.planning.boxes import Boxes
@@ -48,8 +49,9 @@ def bound_terms(bsdf: DualScattering, boxes: Boxes, spread: Callable[[Boxes], tu
 
     With P = (cos theta_i / cos theta_diff)^2, d theta_i = 2 d theta_h, and lobes' masses exact in every cell:
     direct: v 2 c_M int g(theta_h - alpha_p; beta_p) E_p(theta_diff) P d theta_h, likewise scattered with the widened g,
-    E^G_p and (1 - v) d_f a_f^n; back scattering with 4 A_b (2 in the back half alone) for E_p. In a cell where the
-    standard deviation lies in [s_0, s_1], (s_0/s_1) g(x; s_0) <= g(x; s) <= (s_1/s_0) g(x; s_1).
+    E^G_p and (1 - v) d_f a_f^n (or what a Poisson number passes on); back scattering with 4 A_b (2 in the back half
+    alone) for E_p. In a cell where the standard deviation lies in [s_0, s_1], (s_0/s_1) g(x; s_0) <= g(x; s) <=
+    (s_1/s_0) g(x; s_1).
 
     Args:
         bsdf: of one fibre.
@@ -151,10 +153,14 @@ def _chunk(
         for name in ("log_a_f", "beta_f2", "A_b", "delta_b", "sigma_b2")
     )
     count = wide(n, 2)
+    # both laws pass on more for a larger a_f and for fewer fibres, and count more events for more of either
+    law = convention.transmittance
     passed = Interval(
-        torch.exp((count.high * log_a.low).clamp_min(-1e4)), torch.exp((count.low * log_a.high).clamp_min(-1e4))
+        torch.exp(log_transmittance(log_a.low, count.high, law).clamp_min(-1e4)),
+        torch.exp(log_transmittance(log_a.high, count.low, law).clamp_min(-1e4)),
     ) * d_f**convention.density_power
-    widened = beta_f2 * count
+    events = (event_count(torch.exp(a), n, law) for a, n in ((log_a.low, count.low), (log_a.high, count.high)))
+    widened = beta_f2 * Interval(*events)
     share = wide(lit, 3)
     far = wide(unlit, 3) * passed.reshape(lambda x: x.unsqueeze(-2))
     alpha, beta = Interval.exactly(fiber.alpha[:, None]), fiber.beta[:, None]
