@@ -20,7 +20,7 @@ from dsfit.experiment.render_image import develop
 from dsfit.experiment.render_report import markdown, rows
 from dsfit.experiment.rundir import RunDirectory, RunFailure
 from dsfit.experiment.validation import Experiment, load
-from dsfit.render.images import RenderImage, read_image
+from dsfit.render.images import RenderImage, image_errors, read_image
 
 CLI = CliRunner()
 CONFIG = """
@@ -284,3 +284,15 @@ def test_changes_of_cpp_sources_make_another_version(tmp_path: Path, monkeypatch
         provenance.sources_hash.cache_clear()
     assert len({first[0], second[0], third[0]}) == 3
     assert first[1] == second[1] != third[1]
+
+
+def test_images_of_other_sample_counts_differ_by_their_stated_variances(config: Path) -> None:
+    finer = ["camera.width=30", "camera.height=24", "render.tile=30", "render.passes=6"]
+    found, reference = (
+        runner.run(load(config, [*finer, f"render.samples={samples}"]), workers=0).directory for samples in (3, 6)
+    )
+    pair = image_of(found), image_of(reference)
+    assert torch.equal(pair[0].coverage, pair[1].coverage) and torch.equal(pair[0].depth, pair[1].depth)
+    errors = image_errors(*pair)
+    assert abs(errors.mse.value - errors.predicted) < 4 * errors.mse.standard_error
+    assert errors.mse.value > 4 * errors.mse.standard_error  # about 0 if the reference had the image's directions
