@@ -63,6 +63,18 @@ def _sphere(config: Any) -> Light:
     return SphereLight(config.center, config.radius, config.radiance)
 
 
+def _rectangle(config: Any) -> Light:
+    from dsfit.scene import RectangleLight
+
+    return RectangleLight(config.corner, config.edge_u, config.edge_v, config.radiance, config.two_sided)
+
+
+def _ring(config: Any) -> Light:
+    from dsfit.scene import RingLight
+
+    return RingLight(config.center, config.normal, config.inner, config.outer, config.radiance, config.two_sided)
+
+
 def _total(config: Any) -> Light:
     from dsfit.scene import TotalLight
 
@@ -84,6 +96,8 @@ _MAKERS = {
     "constant": _constant,
     "environment": _environment,
     "lobes": _lobes,
+    "rectangle": _rectangle,
+    "ring": _ring,
     "sphere": _sphere,
     "sun": _sun,
     "total": _total,

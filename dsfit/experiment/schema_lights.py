@@ -72,6 +72,29 @@ class SphereLight(Section):
     radiance: Channels = 1.0
 
 
+class RectangleLight(Section):
+    """`[light] kind = "rectangle"`: it shines to the side of `edge_u` x `edge_v`, or to both."""
+
+    kind: Literal["rectangle"]
+    corner: Vector
+    edge_u: Vector
+    edge_v: Vector
+    radiance: Channels = 1.0
+    two_sided: bool = False
+
+
+class RingLight(Section):
+    """`[light] kind = "ring"`: flat, between two radii; it shines to the side of its `normal`, or to both."""
+
+    kind: Literal["ring"]
+    center: Vector
+    normal: Vector
+    inner: NonNegative
+    outer: Length
+    radiance: Channels = 1.0
+    two_sided: bool = False
+
+
 class Part(Section):
     """A light as a part of a total; `share` is what part of the samples it gets, in proportion to the others."""
 
@@ -98,8 +121,16 @@ class SpherePart(SphereLight, Part):
     """`[[light.lights]] kind = "sphere"`"""
 
 
+class RectanglePart(RectangleLight, Part):
+    """`[[light.lights]] kind = "rectangle"`"""
+
+
+class RingPart(RingLight, Part):
+    """`[[light.lights]] kind = "ring"`"""
+
+
 LightPart = Annotated[
-    ConstantPart | LobesPart | EnvironmentPart | SunPart | SpherePart,
+    ConstantPart | LobesPart | EnvironmentPart | SunPart | SpherePart | RectanglePart | RingPart,
     Field(discriminator="kind"),
 ]
 
@@ -113,7 +144,7 @@ class TotalLight(Section):
 
 
 LightConfig = Annotated[
-    ConstantLight | LobesLight | EnvironmentLight | SunLight | SphereLight | TotalLight,
+    ConstantLight | LobesLight | EnvironmentLight | SunLight | SphereLight | RectangleLight | RingLight | TotalLight,
     Field(discriminator="kind"),
 ]
 

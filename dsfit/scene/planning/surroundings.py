@@ -9,7 +9,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dsfit.scene.lights import ConstantLight, EnvironmentLight, Light, TotalLight, VonMisesFisherLights
+from dsfit.scene.lights import (
+    ConstantLight,
+    EnvironmentLight,
+    Light,
+    RectangleLight,
+    RingLight,
+    TotalLight,
+    VonMisesFisherLights,
+)
 from dsfit.scene.lights.cones import ConeLight
 from dsfit.scene.lights.lobes import log_normaliser
 from dsfit.scene.planning.boxes import Boxes, growing
@@ -39,6 +47,10 @@ def radiance(light: Light) -> Radiance | None:
             return None
         parts = [(part.low, part.high, part.total) for part in found if part is not None]
         return Radiance(*(sum(x) for x in zip(*parts, strict=True)))  # type: ignore[arg-type]
+    if type(light) in (RectangleLight, RingLight):
+        # a plane emitter fills at most half of all directions
+        value = light.radiance.detach().to(torch.float64)  # type: ignore[union-attr, operator]
+        return Radiance(torch.zeros_like(value), value, 2 * math.pi * value)
     if isinstance(light, ConeLight):
         value, solid = light.radiance.detach().to(torch.float64), 2 * math.pi * light.cone().rise.detach().double()
         whole = bool((solid > 3 * math.pi).all())
