@@ -242,6 +242,7 @@ void dsfit_fields(const float* theta_r, const float* const* given, int64_t every
                 }
         write_fields(c[0], shape, fields, stride);
     });
+    leave_vectors();
 }
 
 void dsfit_prepare(const Start* s, const float* theta_r, const float* n, const float* v, int64_t count, float* out) {
@@ -251,6 +252,7 @@ void dsfit_prepare(const Start* s, const float* theta_r, const float* n, const f
         shape_at(*s, c[0], c[1], c[2], shape);
         write_fields(c[0], shape, fields, stride);
     });
+    leave_vectors();
 }
 
 // How many contexts need both halves, the direct and the scattered one, and (unless `index` is null) which,
