@@ -335,20 +335,16 @@ inline Activations features(float theta_r, float n, float v, const Moments<near_
 
 // Fully connected layers; each is its biases and then its weights [inputs][outputs]. The last outputs are corrections
 // of modes, widths below, widths above and log weights, `components` of each.
-inline Activations corrections(Activations x) {
-    const float* p = network;
-    for (int l = 0; l < layers; l++) {
-        const int inputs = sizes[l], outputs = sizes[l + 1];
-        Activations y{};
-        for (int o = 0; o < outputs; o++) y[o] = p[o];
-        p += outputs;
-        for (int i = 0; i < inputs; i++, p += outputs) {
-            const float value = l ? soft(x[i]) : x[i];
-            for (int o = 0; o < outputs; o++) y[o] += value * p[o];
-        }
-        x = y;
+template <int L> inline void layer(const float* p, Activations& x) {
+    constexpr int inputs = sizes[L], outputs = sizes[L + 1];
+    std::array<float, outputs> y{};
+    for (int o = 0; o < outputs; o++) y[o] = p[o];
+    for (int i = 0; i < inputs; i++) {
+        const float value = L ? soft(x[i]) : x[i];
+        for (int o = 0; o < outputs; o++) y[o] += value * p[(i + 1) * outputs + o];
     }
-    return x;
+    std::copy(y.begin(), y.end(), x.begin());
+    if constexpr (L + 1 < layers) layer<L + 1>(p + outputs * (inputs + 1), x);
 }
 
 // The width of a piece whose mode lies `distance` outside what can be reached
@@ -403,7 +399,8 @@ inline Context prepare(float theta_r, float n, float v) {
     const Cell row = cell((theta_r / half_pi + 1.0) * (0.5 * (moment_rows - 1)), moment_rows);
     Moments<near_lobes> near = near_moments(row);
     Moments<far_lobes> far = far_moments(row, n);
-    const Activations x = corrections(features(theta_r, n, v, near, far));
+    Activations x = features(theta_r, n, v, near, far);
+    layer<0>(network, x);
 
     // the lobes' shares of the light; back scattering of both kinds is one lobe
     constexpr int lobes = components - 1, last_near = near_lobes - 1, last_far = far_lobes - 1;
@@ -450,9 +447,8 @@ namespace detail {
 
 // ---- Density and draws ----------------------------------------------------------------------------------------
 
-// Density of |phi| given theta_diff: linear between columns and between rows
-inline float law_density(int law, const Direction& d) {
-    const Cell row = cell(d.diff * ((law_rows - 1) / half_pi), law_rows);
+// Density of |phi| given theta_diff, which lies between `row` and the next: linear between columns and between rows
+inline float law_density(int law, Cell row, const Direction& d) {
     const int nodes = law_columns[law];
     const Cell column = cell(d.phi * (2 * (nodes - 1) / two_pi), nodes);
     const std::uint16_t* q = law_table + law_start[law] + row.first * nodes + column.first;
@@ -462,6 +458,7 @@ inline float law_density(int law, const Direction& d) {
 }
 
 inline float density(const Context& context, const Direction& d) {
+    const Cell row = cell(d.diff * ((law_rows - 1) / half_pi), law_rows);
     float known[law_count];
     for (float& x : known) x = -1.0f;
     float total = 0.0f;
@@ -475,7 +472,7 @@ inline float density(const Context& context, const Direction& d) {
             lobe *= d.phi < static_cast<float>(half_pi) ? 0.636619772f : 0.0f;
         } else {
             float& azimuth = known[c.law];
-            if (azimuth < 0.0f) azimuth = law_density(c.law, d);
+            if (azimuth < 0.0f) azimuth = law_density(c.law, row, d);
             lobe *= azimuth;
         }
         total += lobe;
