@@ -17,6 +17,7 @@ from dsfit.errors import InputError
 from dsfit.experiment.compare_render_curve import climb, slope
 from dsfit.experiment.compare_render_painter import Painter, picture_of
 from dsfit.experiment.compare_render_reference import agreement, centred, own_error, reference_image
+from dsfit.experiment.proposal_cache import cached_proposal, is_trained, with_proposal
 from dsfit.experiment.rundir import RunDirectory, slug
 from dsfit.experiment.schema import Config
 from dsfit.experiment.schema_render import Technique
@@ -60,14 +61,12 @@ def compare_render(
 def trained(technique: Technique, config: Config, directory: RunDirectory, say: Callable[[str], None]) -> Technique:
     """An amortised technique that is to be trained, with the file of its proposal: trained now, or for another run of
     the same fibre. The seconds of that training count as its preparation."""
-    options = dict(technique.options)
-    if technique.kind != "amortised" or not options.pop("train", False):
+    if not is_trained(technique):
         return technique
-    from dsfit.experiment.proposal_cache import cached_proposal
-
-    path, facts = cached_proposal(config, options.pop("training", {}), directory.path.parent, say)
-    loaded = {**options, "file": str(path), "file_seconds": float(facts["seconds"])}
-    return technique.model_copy(update={"options": loaded})
+    training = dict(technique.options.get("training") or {})
+    path, facts = cached_proposal(config, training, directory.path.parent, say)
+    loaded = with_proposal(technique, path)
+    return loaded.model_copy(update={"options": {**loaded.options, "file_seconds": float(facts["seconds"])}})
 
 
 def small(config: Config) -> Config:
@@ -154,12 +153,16 @@ class _Cell:
         self.say(f"{technique.name}: preparation")
         brush = picture_of(small(self.config)).painter(trained(technique, self.config, self.directory, self.say))
 
-        def measure(samples: int) -> tuple[Tensor, float]:
-            self.say(f"{technique.name}: {samples} samples per hit")
-            return brush.paint(samples, _SEED + samples)
+        floor = own_error(self.reference, self.eps)
 
-        rungs = climb(measure, max(compare.first, brush.least), max(compare.most, brush.least), compare.seconds)
-        rows = [self._row(samples, seconds, brush, radiance) for samples, seconds, radiance in rungs]
+        def measure(samples: int) -> dict[str, Any]:
+            self.say(f"{technique.name}: {samples} samples per hit")
+            radiance, seconds = brush.paint(samples, _SEED + samples)
+            return self._row(samples, seconds, brush, radiance)
+
+        rows = climb(
+            measure, max(compare.first, brush.least), max(compare.most, brush.least), compare.seconds, floor
+        )  # fmt: skip
         images: dict[str, np.ndarray] = {}
         pictures: dict[str, Any] = {}
         last = rows[-1]
@@ -173,7 +176,6 @@ class _Cell:
             radiance, seconds = brush.paint(samples, 2 * _SEED + k)
             pictures[name] = self._picture(name, samples, seconds, brush, radiance, technique.name)
             images[name] = radiance.to(torch.float32).numpy()
-        floor = own_error(self.reference, self.eps)
         found = {
             "prepare": brush.preparation,
             "rungs": rows,
@@ -251,12 +253,15 @@ def check(raw: RawConfig, config: Config) -> None:
     left, top, right, bottom = config.compare.crop
     if not (left < right and top < bottom):
         raise raw.error(("compare", "crop"), "left, top, right, bottom with left < right and top < bottom")
+    from dsfit.experiment.render import check_training
     from dsfit.experiment.render_scene import check_technique
 
-    for k, technique in enumerate(techniques):
-        check_technique(raw, ("compare", "techniques", k), technique)
-    for name in ("technique", "check"):
-        check_technique(raw, ("compare", "reference", name), getattr(config.compare.reference, name))
+    places = [(("compare", "techniques", k), technique) for k, technique in enumerate(techniques)]
+    reference = config.compare.reference
+    places += [(("compare", "reference", name), getattr(reference, name)) for name in ("technique", "check")]
+    for place, technique in places:
+        check_technique(raw, place, technique)
+        check_training(raw, place, technique, config)
 
 
 __all__ = ["InputError", "REFERENCE", "check", "compare_render", "small", "tone_map", "work_of"]

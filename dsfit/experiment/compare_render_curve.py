@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
 from dsfit.race.curve import Curve
 
-T = TypeVar("T")
 _LAST = 5
 _CLEAR = 1.5
 
@@ -27,21 +26,23 @@ class Time:
 
 
 def climb(
-    measure: Callable[[int], tuple[T, float]], first: int, most: int, budget: float
-) -> list[tuple[int, float, T]]:
-    """Measure with `first`, twice, four times ... as many samples, until the next rung would not fit into the budget of
-    seconds or has more than `most` samples; at least one rung.
+    measure: Callable[[int], dict[str, Any]], first: int, most: int, budget: float, floor: float = 0.0
+) -> list[dict[str, Any]]:
+    """Measure with `first`, twice, four times ... as many samples; at least one rung.
+
+    It ends where the next rung would not fit into the budget of seconds or has more than `most` samples, and where the
+    error is below `floor`, the reference's own: further rungs would measure the reference.
 
     Args:
-        measure: takes samples, returns a result and the seconds it took.
+        measure: takes samples, returns a row with `seconds` and `error`.
     """
-    rungs: list[tuple[int, float, T]] = []
+    rungs: list[dict[str, Any]] = []
     samples, spent = first, 0.0
     while True:
-        result, seconds = measure(samples)
-        rungs.append((samples, seconds, result))
-        spent, samples = spent + seconds, 2 * samples
-        if samples > most or spent + 2 * seconds > budget:
+        row = measure(samples)
+        rungs.append(row)
+        spent, samples = spent + row["seconds"], 2 * samples
+        if samples > most or spent + 2 * row["seconds"] > budget or row["error"] < floor:
             return rungs
 
 

@@ -119,13 +119,14 @@ def rotation(axis: list[float], angle: float) -> torch.Tensor:
 def camera_of(config: Config, strands: Strands) -> Camera:
     """The camera; without a position it sees the whole geometry."""
     from dsfit.render.camera import Camera
-    from dsfit.render.geometry.view import suggested_view
+    from dsfit.render.geometry import VIEWS, suggested_view
 
     c = config.camera
     position: Any = c.position
     target: Any = c.target
     if position is None:
-        seen, middle, _, _ = suggested_view(strands, c.direction, c.fov_deg)
+        away = c.direction or VIEWS.get(config.geometry.kind, (0.35, 0.25, 1.0))
+        seen, middle, _, _ = suggested_view(strands, away, c.fov_deg)
         target = middle if target is None else torch.tensor(target, dtype=torch.float64)
         position = target + (seen - middle) * c.margin
     elif target is None:

@@ -105,10 +105,11 @@ GeometryConfig = Annotated[GeneratorGeometry | HairFile | PbrtFile, Field(discri
 
 class CameraConfig(Section):
     """`[camera]`: a pinhole; `fov_deg` is the vertical angle of view. Without a `position`, it stands in `direction`
-    from the strands, `margin` times as far away as it takes to see all of them in a square picture."""
+    from the strands (left out: one that suits the generator), `margin` times as far away as it takes to see all of them
+    in a square picture."""
 
     position: Vector | None = None
-    direction: Vector = [0.35, 0.25, 1.0]
+    direction: Vector | None = None
     margin: Annotated[float, Field(ge=0.05, le=100)] = 1.0
     target: Vector | None = None
     up: Vector = [0.0, 1.0, 0.0]
@@ -170,8 +171,8 @@ class ReferenceConfig(Section):
     technique that checks it, with `check_passes` passes."""
 
     technique: Technique = Technique(light=0.25)
-    samples: Samples = 256
-    passes: Annotated[int, Field(ge=4, le=4096)] = 8
+    samples: Samples = 1024
+    passes: Annotated[int, Field(ge=4, le=4096)] = 4
     check: Technique = Technique(kind="chapter", options={"model": "one"}, light=0.25)
     check_samples: Samples = 128
     check_passes: Annotated[int, Field(ge=4, le=4096)] = 8

@@ -59,10 +59,11 @@ def _sheet(
     shape = reference[window].shape
     wide = 1.9
     tall = wide * shape[0] / shape[1]
-    figure = new_figure(columns * wide + 0.9, lines * (2 * tall + 0.75) + 0.4)
+    figure = new_figure(columns * wide + 0.9, lines * (2 * tall + 0.65) + 0.3)
     axes = figure.subplots(2 * lines, columns, squeeze=False)
     for axis in axes.flat:
-        axis.set_axis_off()
+        axis.set(xticks=[], yticks=[])
+        axis.spines[:].set_visible(False)
     shown = None
     for k, cell in enumerate(cells):
         image = torch.from_numpy(arrays[cell["index"]][which])
@@ -71,13 +72,10 @@ def _sheet(
         error = relative_squared_error(image, reference, number(facts["eps"])).sqrt()[window]
         shown = below.imshow(error.clamp_min(1e-6).numpy(), norm="log", cmap="magma", interpolation="nearest")
         shown.set_clim(_LOW, _HIGH)
-        below.set_title(_numbers(cell[which]), fontsize=6.5, y=-0.02, va="top")
+        below.set_xlabel(_numbers(cell[which]), fontsize=6.5, labelpad=2)
     last = axes[2 * ((count - 1) // columns)][(count - 1) % columns]
     _picture(last, reference[window], tone, "reference")
-    last.text(
-        0.5, -0.04, f"own error {100 * number(facts['own_error']):.2g} %", transform=last.transAxes, ha="center",
-        va="top", fontsize=6.5,
-    )  # fmt: skip
+    last.set_xlabel(f"own error {100 * number(facts['own_error']):.2g} %", fontsize=6.5, labelpad=2)
     if shown is not None:
         bar = figure.colorbar(shown, ax=axes, shrink=0.5, aspect=40, pad=0.01)
         bar.ax.tick_params(labelsize=6.5)
