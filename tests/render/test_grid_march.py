@@ -259,7 +259,7 @@ def test_copies_and_pickles_give_the_same() -> None:
         (torch.zeros(3), torch.full((3,), 1e-20), "direction"),
         (torch.zeros(2), torch.ones(3), "origin"),
         (torch.zeros(3), torch.ones(3, dtype=torch.int64), "direction"),
-        (torch.zeros(4, 3), torch.ones(5, 3), "direction"),
+        (torch.zeros(4, 3), torch.ones(5, 3), "origin, direction"),
         ([0.0, 0.0, 0.0], torch.ones(3), "origin"),
     ],
 )

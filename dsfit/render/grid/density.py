@@ -9,7 +9,16 @@ import torch
 from torch import Tensor
 
 from dsfit.arguments import all_finite
-from dsfit.errors import FLOATS, InputError, as_number, as_real, check_choice, check_finite, check_range
+from dsfit.errors import (
+    FLOATS,
+    InputError,
+    as_number,
+    as_real,
+    check_broadcast,
+    check_choice,
+    check_finite,
+    check_range,
+)
 from dsfit.render.grid.deposit import deposit
 from dsfit.render.grid.march import SELF, march
 from dsfit.render.grid.native import Compiled, NoCompiler
@@ -28,7 +37,7 @@ class DensityGrid:
     """Fibres as a density: per voxel the second moment of their tangents.
 
     `T = sum of 2 r l t t^T / V` over the pieces of fibre in a voxel of volume V (length l, radius r, unit tangent t).
-    Its trace is what an isotropic ray crosses at most per unit length. In direction d the expected crossings per unit
+    Its trace is the density of length x diameter. In direction d the expected crossings per unit
     length are `q(d) = sum of 2 r l |sin(t, d)| / V`, which the moments give as
 
         q = (P - k W) / sqrt(P),  P = tr T (tr T - d^T T d),  W = tr T d^T T d - |T d|^2,
@@ -155,10 +164,7 @@ class DensityGrid:
             InputError: shapes that do not broadcast, other dtypes, values not finite, a direction of length 0.
         """
         origin, direction = _ray("origin", origin), _ray("direction", direction)
-        try:
-            shape = torch.broadcast_shapes(origin.shape, direction.shape)
-        except RuntimeError:
-            raise InputError("direction", tuple(direction.shape), f"to broadcast with {tuple(origin.shape)}") from None
+        shape = (*check_broadcast(origin=origin[..., 0], direction=direction[..., 0]), 3)
         longest = direction.detach().abs().amax(-1)
         if not bool(((longest > 1e-15) & (longest < 1e15)).all()):
             raise InputError("direction", float(longest.min()), "vectors of length in [1e-15, 1e15]")
@@ -180,7 +186,7 @@ class DensityGrid:
         """n_own of `crossings`."""
         return radius * (2 * SELF / self.voxel)
 
-    def hints(self, position: Tensor, v: Any = "poisson") -> tuple[Tensor, Tensor]:
+    def hints(self, position: Tensor, v: str | float = "poisson") -> tuple[Tensor, Tensor]:
         """Representative n and mean v at points `[*, 3]`, as `Scattering.hints`: "transmitted", exp(-n) is the mean of
         exp(-n(d)) over the sphere, and v the mean by the rule of `Scattering`. Looked up in a field that is computed
         once, on a lattice of `table.LATTICE` points along the longest side. No gradients."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from dsfit.errors import InputError, as_real, check_choice, check_finite, check_range
+from dsfit.errors import InputError, as_number, check_choice, check_finite
 
 if TYPE_CHECKING:
     from dsfit.render.grid.density import DensityGrid
@@ -43,6 +43,7 @@ class DirectionalTable:
     n: Tensor
     low: Tensor
     high: Tensor
+    _fields: dict[str | float, tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def of(
@@ -85,27 +86,26 @@ class DirectionalTable:
                 n = n + weight_i * weight_j * self._between(self.n.flatten(-2), origin, cell)
         return n.to(direction)
 
-    def hints(self, position: Tensor, v: Any = "poisson") -> tuple[Tensor, Tensor]:
+    def hints(self, position: Tensor, v: str | float = "poisson") -> tuple[Tensor, Tensor]:
         """Representative n and mean v `[*]` at points `[*, 3]`; see `DensityGrid.hints`."""
         check_finite("position", position)
-        transmitted, share = self._representative(v)
-        n, lit = (self._between(x.unsqueeze(-1), position).squeeze(-1).to(position) for x in (transmitted, share))
+        rule = check_choice("v", v, ("poisson", "threshold")) if isinstance(v, str) else as_number("v", v, 0.0, 1.0)
+        if rule not in self._fields:
+            self._fields[rule] = self._representative(rule)
+        n, lit = (self._between(x.unsqueeze(-1), position).squeeze(-1).to(position) for x in self._fields[rule])
         return n, torch.where(n == 0, 1.0, lit.clamp(0.0, 1.0))
 
-    def _representative(self, v: Any) -> tuple[Tensor, Tensor]:
-        """The two fields `[X, Y, Z]`."""
+    def _representative(self, rule: str | float) -> tuple[Tensor, Tensor]:
+        """n and v at the lattice's points, `[X, Y, Z]`."""
         from dsfit.scene.scattering import THRESHOLD
 
         n = self.n.flatten(-2).to(torch.float64)
         transmitted = (math.log(n.shape[-1]) - torch.logsumexp(-n, dim=-1)).clamp_min(0.0)
         transmitted = torch.where((n == 0).all(-1), 0.0, transmitted)
-        if isinstance(v, str):
-            check_choice("v", v, ("poisson", "threshold"))
-            share = torch.exp(-transmitted) if v == "poisson" else (n <= THRESHOLD).double().mean(-1)
-        else:
-            number = check_range("v", as_real("v", v), 0.0, 1.0)
-            share = torch.where(n == 0, 1.0, number.to(n)).mean(-1)
-        return transmitted, share
+        if rule == "poisson":
+            return transmitted, torch.exp(-transmitted)
+        lit = n <= THRESHOLD if rule == "threshold" else torch.where(n == 0, 1.0, rule)
+        return transmitted, lit.to(n).mean(-1)
 
     def _between(self, values: Tensor, position: Tensor, cell: Tensor | None = None) -> Tensor:
         """Trilinear in `values` `[X, Y, Z, ...]`; with `cell` `[*]`, only that entry of the last dimension."""
