@@ -46,8 +46,11 @@ def compare_files(image: Path, reference: Path, out: Path | None = None) -> Comp
         raise InputError(str(image), sizes[0], f"the size and channels of {reference}: {sizes[1]}")
     errors, flip = image_errors(*pair), hdr_flip(*pair)
     folder = image.parent if out is None else out
-    picture = folder / f"{image.stem}-against-{reference.stem}.png"
-    _draw(pair, errors, flip, f"{image.stem} against {reference.stem}", picture)
+    names = image.stem, reference.stem
+    if names[0] == names[1]:  # image.exr of two runs
+        names = tuple(f"{path.resolve().parent.name}-{path.stem}" for path in (image, reference))
+    picture = folder / f"{names[0]}-against-{names[1]}.png"
+    _draw(pair, errors, flip, " against ".join(names), picture)
     return Comparison(*pair, errors, flip, picture)
 
 

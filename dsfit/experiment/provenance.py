@@ -55,7 +55,8 @@ def run_id(config: Config) -> str:
     """Hash of everything that decides the numbers: the resolved config without where it is written, files it reads,
     and the code."""
     shown = {"exposure", "tone_map"}  # change a rendering's PNG, which any run makes anew
-    data = config.model_dump(exclude={"output": True, "title": True, "render": shown})
+    unused = {"compare": True} if config.kind == "render" else {}
+    data = config.model_dump(exclude={"output": True, "title": True, "render": shown, **unused})
     for part in (data["light"], *data["light"].get("lights", []), data["geometry"]):
         if path := part.get("path"):
             part["path"] = hashlib.sha256(Path(path).read_bytes()).hexdigest()

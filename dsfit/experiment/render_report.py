@@ -21,6 +21,7 @@ def rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     image, render = result["image"], result["config"]["render"]
     technique, sessions = render["technique"], result["provenance"]["sessions"]
     workers = max(session.get("workers") or 1 for session in sessions)
+    processes = f"{workers} process{'es' if workers > 1 else ''}"
     interrupted = f", in {len(sessions)} sittings" if len(sessions) > 1 else ""
     directions = f"{render['passes']} passes of {render['samples']} directions per hit"
     pixels = image["width"] * image["height"]
@@ -28,7 +29,7 @@ def rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     found = [
         ("image", f"{image['width']} x {image['height']} pixels, {_percent(image['covered'])} covered"),
         ("technique", f"{technique['kind']}{share}, {technique['uniforms']} points"),
-        ("time, wall", f"{_time(image['wall_seconds'])} with {workers or 1} processes{interrupted}"),
+        ("time, wall", f"{_time(image['wall_seconds'])} with {processes}{interrupted}"),
         ("time, CPU", f"{_time(image['cpu_seconds'])} ({_time(number(image['cpu_seconds']) / pixels)} per pixel)"),
         ("preparation, CPU", f"{_time(image['preparation_cpu_seconds'])}, all processes together"),
     ]

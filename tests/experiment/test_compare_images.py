@@ -57,6 +57,14 @@ def test_the_table_has_the_references_share_and_what_is_left(tmp_path: Path) -> 
     assert table["MSE"][1:] == ["-", "-"] == table["RMSE"][1:]
 
 
+def test_images_of_the_same_name_keep_apart_by_their_folders(tmp_path: Path) -> None:
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        write(tmp_path / folder / "image.exr", 0.1, len(folder), shape=(6, 7, 3))
+    found = compare_files(tmp_path / "one" / "image.exr", tmp_path / "two" / "image.exr", tmp_path)
+    assert found.picture == tmp_path / "one-image-against-two-image.png" and found.picture.is_file()
+
+
 def test_images_of_other_programs_can_be_compared(tmp_path: Path) -> None:
     write_exr(tmp_path / "a.exr", {"RGB": np.full((8, 9, 3), 1.1, np.float32)})
     write_exr(tmp_path / "b.exr", {"RGB": np.full((8, 9, 3), 1.0, np.float32)})

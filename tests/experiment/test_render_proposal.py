@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -182,3 +184,23 @@ def test_a_real_training_of_few_steps_renders_and_is_found_again(config: Path) -
     assert first.result["image"]["training"]["steps"] == 3 and first.result["image"]["training"]["seconds"] > 0
     again = runner.run(load(config, [small, "render.seed=5"]), workers=0)
     assert again.result["image"]["training"]["found"] is True
+
+
+@pytest.mark.slow
+def test_two_processes_that_train_at_once_end_with_the_same_proposal(config: Path) -> None:
+    """Both begin before either can have finished; each keeps its own copy."""
+    small = "render.technique.options.training={steps=3, inclinations=4, pairs=2, hidden=[4]}"
+    command = [sys.executable, "-m", "dsfit.cli", "render", str(config), "--workers", "0", "--set", small]
+    started = [
+        subprocess.Popen([*command, "--set", f"render.seed={seed}"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        for seed in (1, 2)
+    ]
+    for process in started:
+        output, _ = process.communicate(timeout=300)
+        assert process.returncode == 0, output.decode()
+    folders = [path for path in (config.parent / "runs").iterdir() if path.name != FOLDER]
+    proposals = [load_proposal(folder / "proposals" / "amortised.npz") for folder in folders]
+    (kept,) = (config.parent / "runs" / FOLDER).glob("*.npz")
+    weights = [list(one.network.parameters()) for one in (*proposals, load_proposal(kept))]
+    assert all(torch.equal(a, b) for other in weights[1:] for a, b in zip(weights[0], other, strict=True))
+    assert len(folders) == 2 and len(list((config.parent / "runs" / FOLDER).iterdir())) == 2

@@ -44,8 +44,11 @@ def error_maps(image: RenderImage, reference: RenderImage, eps: float, flip: Fli
     norm = _log_range(relative)
     text = f"(image − reference)² / (reference² + {eps:.2g})\n{norm.vmin:.1e} to {norm.vmax:.1e}"
     _panel(figure, axes[1], relative, text, norm, "viridis")
-    text = f"HDR-FLIP, {flip.pixels_per_degree:g} pixels per degree\n0 to 1"
-    _panel(figure, axes[2], _masked(flip.map, covered), text, Normalize(0, 1), "magma")
+    flips = _masked(flip.map, covered)
+    most = float(np.percentile(flips.compressed(), 99)) if flips.count() else 1.0
+    high = next((x for x in (0.05, 0.1, 0.2, 0.5) if x >= most), 1.0)
+    text = f"HDR-FLIP, {flip.pixels_per_degree:g} pixels per degree\n0 to {high:g}"
+    _panel(figure, axes[2], flips, text, Normalize(0, high), "magma")
     figure.suptitle(title, fontsize=10)
     return figure
 
