@@ -15,6 +15,10 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
+
+# what there is no room for, so that the times are whole
+_SHORTENED = Column(ratio=1, no_wrap=True, overflow="ellipsis")
 
 
 class BarProgress:
@@ -25,14 +29,15 @@ class BarProgress:
         self._bar = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}", markup=False),
-            BarColumn(bar_width=30),
+            BarColumn(bar_width=20),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(),
-            TextColumn("{task.fields[what]}", style="dim", markup=False),
+            TextColumn("{task.fields[what]}", style="dim", markup=False, table_column=_SHORTENED),
             console=console,
             transient=True,
+            expand=True,
             disable=not sys.stderr.isatty(),
         )
         self._task = self._bar.add_task(title, total=None, what="")

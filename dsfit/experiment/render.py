@@ -113,7 +113,7 @@ def render(
     technique.prepare(scene)
     prepared = clock.read()
     top, left, bottom, right = identity["tile"]
-    say(f"tile at row {top}, column {left}")
+    say(f"row {top}, column {left}")
     tile = render_tile(
         scene, technique, range(top, bottom), range(left, right),
         samples=asked.samples, passes=asked.passes, seed=direction_seed(config),
