@@ -36,28 +36,29 @@ class LightAt(Proposal):
 class MixSampler(Sampler):
     """Several distributions with given shares of the samples.
 
-    "multi": counts in proportion to the shares, at least 1 each; with fewer samples than strategies, and for "one",
-    every sample chooses its strategy by its first uniform number. Balance divides by the mixture's density, which is
-    all that it takes; other rules weigh by `dsfit.mis`.
+    "multi": counts in proportion to the shares. Where the smallest share is less than one sample, and for "one", every
+    sample chooses its strategy by its first uniform number. Balance divides by the mixture's density, which is all that
+    it takes; other rules weigh by `dsfit.mis`.
 
     Args:
         problem: the integrand and the kind of uniform numbers.
         distributions: the strategies.
-        shares: of each, > 0, with sum 1.
+        shares: of each, > 0, with sum 1; with model "one" and balance also a tensor `[strategies, B]`.
         contexts: `[B]`.
         rule: a heuristic other than "optimal".
         model: "multi" or "one".
     """
 
     def __init__(
-        self, problem: Problem, distributions: Sequence[Distribution], shares: Sequence[float], contexts: Context,
-        rule: Any = "balance", model: str = "multi",
+        self, problem: Problem, distributions: Sequence[Distribution], shares: Sequence[float] | Tensor,
+        contexts: Context, rule: Any = "balance", model: str = "multi",
     ) -> None:  # fmt: skip
         self.problem, self.distributions, self.contexts = problem, list(distributions), contexts
-        self.shares, self.rule, self.model = list(shares), heuristic(rule), model
+        self.shares = shares if isinstance(shares, Tensor) else list(shares)
+        self.rule, self.model = heuristic(rule), model
 
     def estimate(self, samples: int, generator: torch.Generator) -> Tensor:
-        if self.model == "one" or samples < len(self.shares):
+        if self.model == "one" or samples * min(self.shares) < 1:
             return self._one(samples, generator)
         counts = split_counts(samples, self.shares)
         used = torch.tensor([n / samples for n in counts], dtype=self.contexts.dtype)
@@ -70,12 +71,12 @@ class MixSampler(Sampler):
         return torch.as_tensor(total) / samples
 
     def _one(self, samples: int, generator: torch.Generator) -> Tensor:
-        used = torch.tensor(self.shares, dtype=self.contexts.dtype)
+        used = torch.as_tensor(self.shares, dtype=self.contexts.dtype)
         edges = used.cumsum(0)[:-1]
         dimension = 1 + max(d.dimension for d in self.distributions)
         total: Tensor | float = 0.0
         for u in self.problem.draw(samples, self.contexts, dimension, generator):
-            choice = torch.bucketize(u[..., 0].contiguous(), edges, right=True)
+            choice = sum((u[..., 0] >= edge).int() for edge in edges)
             omega: Tensor | None = None
             for s, d in enumerate(self.distributions):
                 drawn = d.sample(u[..., 1 : 1 + d.dimension])
@@ -90,7 +91,7 @@ class MixSampler(Sampler):
         if not isinstance(self.rule, Balance):
             z = contribution(value, torch.stack(torch.broadcast_tensors(*logs)), own, used, self.rule)
             return z.sum(0, dtype=torch.float64)
-        log_p = log_sum_exp(torch.stack(torch.broadcast_tensors(*logs), dim=-1) + torch.log(used))
+        log_p = log_sum_exp(torch.stack(torch.broadcast_tensors(*logs), dim=-1) + torch.log(used).movedim(0, -1))
         z = torch.where(value == 0, 0.0, value * torch.exp(-log_p).unsqueeze(-1))
         return z.sum(0, dtype=torch.float64)
 
@@ -98,7 +99,7 @@ class MixSampler(Sampler):
         if not isinstance(self.rule, Balance) or self.model == "multi":
             return None
         logs = torch.stack(torch.broadcast_tensors(*(d.log_prob(omega) for d in self.distributions)), dim=-1)
-        return log_sum_exp(logs + torch.log(logs.new_tensor(self.shares)))
+        return log_sum_exp(logs + torch.log(torch.as_tensor(self.shares).to(logs)).movedim(0, -1))
 
 
 def with_light(

@@ -27,6 +27,8 @@ class Entry:
 
 _OWN = {
     "light": Entry("directions by the light's radiance alone", "light", "LightAlone"),
+    "best_mix": Entry("the chapter's proposals and light, shares fitted to the scene", "best_mix", "BestMix"),
+    "guided": Entry("the amortised mixture, its lobes weighed by the light that comes through", "guided", "Guided"),
     "amortised": Entry("the amortised mixture with the grid's hints", "amortised", "Amortised"),
 }
 _LEFT_OUT = ("kernel",)  # evaluates a constant light and the context's own n: it would not estimate a picture
