@@ -297,3 +297,11 @@ def test_images_of_other_sample_counts_differ_by_their_stated_variances(config: 
     errors = image_errors(*pair)
     assert abs(errors.mse.value - errors.predicted) < 4 * errors.mse.standard_error
     assert errors.mse.value > 4 * errors.mse.standard_error  # about 0 if the reference had the image's directions
+
+
+@pytest.mark.slow
+def test_the_shipped_quick_config_renders_compiled_and_smooth(tmp_path: Path) -> None:
+    config = Path(__file__).parents[2] / "configs" / "render_quick.toml"
+    found = runner.run(load(config), tmp_path, workers=0).result["image"]
+    assert found["backend"] == "compiled" and found["tiles"] == 9
+    assert 0.4 < found["covered"] < 0.9 and found["relative_rms_error"] < 0.1

@@ -27,7 +27,7 @@ class RenderImage:
         radiance: `[H, W, C]`, linear; premultiplied by coverage where the background is black.
         variance: `[H, W, C]`, of the pixel's value (not of one sample); nan where it was not estimated.
         samples: `[H, W]`, directions evaluated in the pixel.
-        n: `[H, W]`, mean scatter count hint of the pixel's hits; nan where there is none.
+        n: `[H, W]`, mean scatter count hint of the pixel's hits; 0 or nan where there is none.
         time: `[H, W]`, seconds: the tile's, shared out by samples.
         coverage: `[H, W]` in [0, 1], the share of the pixel's rays that met a fibre.
         depth: `[H, W]`, mean distance of the hits from the camera.
