@@ -179,7 +179,7 @@ class _Cell:
         found = {
             "prepare": brush.preparation,
             "rungs": rows,
-            "slope": slope([r["seconds"] for r in rows], [r["error"] for r in rows], floor),
+            "slope": slope([r["samples"] for r in rows], [r["error"] for r in rows], floor),
             **pictures,
         }
         return {**found, **_verdict(rows)}, images

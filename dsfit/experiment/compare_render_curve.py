@@ -46,12 +46,12 @@ def climb(
             return rungs
 
 
-def slope(seconds: Sequence[float], errors: Sequence[float], floor: float = 0.0) -> float:
-    """Exponent a of error ~ t^a (root mean squares; -1/2 for random points) over the last rungs, by least squares in
-    logarithms; rungs whose error is not well above `floor`, the reference's own, are left out. nan for fewer than
-    three rungs."""
-    good = [(t, e) for t, e in zip(seconds, errors, strict=True) if t > 0 and math.isfinite(e) and e > _CLEAR * floor]
-    good = [(t, e) for t, e in good if e > 0][-_LAST:]
+def slope(samples: Sequence[float], errors: Sequence[float], floor: float = 0.0) -> float:
+    """Exponent a of error ~ samples^a (root mean squares; -1/2 for random points) over the last rungs, by least squares
+    in logarithms: that of long run times, without what is spent per hit before the first sample. Rungs whose error is
+    not well above `floor`, the reference's own, are left out. nan for fewer than three rungs."""
+    good = [(t, e) for t, e in zip(samples, errors, strict=True) if math.isfinite(e) and e > max(_CLEAR * floor, 0.0)]
+    good = good[-_LAST:]
     if len(good) < 3:
         return math.nan
     t, e = np.log(np.array(good)).T

@@ -103,7 +103,7 @@ def caption(result: dict[str, Any]) -> str:
         f"and channels (p = {number(check['p_value']):.2g}).",
         "Times are CPU seconds of one thread: directions and shading. Rays, grid and hints, "
         f"{seconds(sum(map(number, facts['shared_seconds'].values())))}, are the same for all and not in them.",
-        "prepare: training, shares, tables and compilers; all counted: with it. slope: of log error over log time "
+        "prepare: training, shares, tables and compilers; all counted: with it. slope: of log error over log samples "
         "(-0.5 for random points).",
         "heuristic alike, heuristic, uniform: how many times as long (prepared) these take to the same error: the best "
         "of the chapter's with the same points and light sampling or none as in the row; the best of them with random "

@@ -12,7 +12,10 @@ from matplotlib.ticker import FuncFormatter
 
 from dsfit.experiment.compare_render_summary import painted, reference_of
 from dsfit.experiment.files import number
-from dsfit.experiment.plots.style import COLORS, MARKERS, new_figure, short
+from dsfit.experiment.plots.style import COLORS, new_figure, short
+
+_MARKERS = ("o", "s", "^", "D", "v", "h", "<", ">")
+_HIGHEST = 3.0
 
 
 def compare_curves(result: dict[str, Any]) -> Figure:
@@ -47,7 +50,7 @@ def _style(cell: dict[str, Any], cells: list[dict[str, Any]]) -> dict[str, Any]:
     line = "-" if cell["uniforms"] == "sobol" else (0, (4, 2))
     return {
         "color": COLORS[k % len(COLORS)],
-        "marker": MARKERS[k % len(MARKERS)],
+        "marker": _MARKERS[k % len(_MARKERS)],
         "linestyle": ":" if cell["heavy"] else line,
         "markerfacecolor": "white" if number(cell["light"]) else None,
         "linewidth": 1.3,
@@ -78,7 +81,7 @@ def _dress(axis: Axes, result: dict[str, Any], counted: bool) -> None:
     for target in result["config"]["compare"]["targets"]:
         axis.axhline(number(target), color="#555555", linestyle=":", linewidth=0.8)
     low, high = axis.get_ylim()
-    axis.set_ylim(low, min(high, 5.0))
+    axis.set_ylim(low, min(high, _HIGHEST))
     axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g} %"))
     axis.grid(True, which="major")
     axis.set_title("slopes in brackets" if not counted else "everything counted")

@@ -59,7 +59,7 @@ def _sheet(
     shape = reference[window].shape
     wide = 1.9
     tall = wide * shape[0] / shape[1]
-    figure = new_figure(columns * wide + 0.9, lines * (2 * tall + 0.65) + 0.3)
+    figure = new_figure(columns * wide + 0.9, lines * (2 * tall + 0.42) + 0.3)
     axes = figure.subplots(2 * lines, columns, squeeze=False)
     for axis in axes.flat:
         axis.set(xticks=[], yticks=[])
