@@ -29,8 +29,13 @@ from dsfit.scene import (
     ConstantLight,
     ConstantScattering,
     EnvironmentLight,
+    RectangleLight,
+    RingLight,
     SlabScattering,
+    SphereLight,
     SphereScattering,
+    SunLight,
+    TotalLight,
     VonMisesFisherLights,
 )
 from tests.fuzz.common import anything, attempt, finite, fuzz, mostly_fine, numbers, refused, tensors
@@ -118,6 +123,21 @@ vectors = st.lists(numbers, min_size=2, max_size=3) | st.lists(st.lists(numbers,
 def test_lobes_light(directions: Any, kappa: Any, intensity: Any, ambient: Any, kind: Any, rotation: Any) -> None:
     _light(VonMisesFisherLights, directions, kappa, intensity, ambient, kind=kind)
     _light(VonMisesFisherLights, [0.3, 0.2], 20.0, rotation=rotation)
+
+
+places = st.lists(numbers, min_size=3, max_size=3) | values
+
+
+@fuzz(300)
+@given(places, places, places, values, values, values, st.booleans() | anything, st.none() | values)
+def test_emitters(a: Any, b: Any, c: Any, size: Any, other: Any, radiance: Any, flag: Any, rotation: Any) -> None:
+    _light(SunLight, a, size, radiance)
+    _light(SunLight, a, radiance=radiance, rotation=rotation)
+    _light(SphereLight, a, size, radiance, position=b)
+    _light(RectangleLight, a, b, c, radiance, flag)
+    _light(RectangleLight, a, [0.0, 0.0, 2.0], [3e-6, 0.0, 0.0], radiance, flag, position=b)
+    _light(RingLight, a, b, size, other, radiance, flag, position=c)
+    _light(TotalLight, [SphereLight([0.0, 0.0, 1.0], 0.5), ConstantLight()], [size, other])
 
 
 images = st.tuples(

@@ -7,7 +7,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from dsfit.arguments import all_finite
+from dsfit.arguments import check_inside
 from dsfit.errors import InputError, as_real, check_range
 from dsfit.scene.lights.base import Light, check_rotation
 
@@ -43,7 +43,8 @@ class NearbyLight(Light):
     """A light that looks different from different points.
 
     Args:
-        position: the points it is seen from, `[3]` or `[*batch, 3]`, in world coordinates. None: the origin.
+        position: the points it is seen from, `[3]` or `[*batch, 3]`, in world coordinates within +- 1e12. None: the
+            origin.
         rotation: see `Light`.
     """
 
@@ -73,4 +74,4 @@ def _check_position(position: Any) -> Tensor | None:
     value = as_real("position", position)
     if value.shape[-1:] != (3,):
         raise InputError("position", tuple(value.shape), "shape [..., 3]")
-    return value if all_finite(value) else check_range("position", value, -MAX_LENGTH, MAX_LENGTH)
+    return check_inside("position", value, -MAX_LENGTH, MAX_LENGTH)

@@ -44,13 +44,23 @@ class SphericalRectangle:
     def solid_angle(self) -> Tensor:
         """Solid angle `[*batch]` with full relative accuracy; 0 in the plane."""
         value = self._mass(self.width)
-        return torch.where(self.visible, value, 0.0)
+        # nearby, the triangles lose digits along their common side and the four corners do not
+        return torch.where(self.visible, torch.where(value > 0.5, self._corner_sum(), value), 0.0)
 
     @functools.cached_property
     def visible(self) -> Tensor:
         """Whether the point is far enough off the plane to see the rectangle at all, `[*batch]`."""
         reach = self.x0.abs() + self.y0.abs() + self.width + self.height
         return (self.distance > 1e-13 * reach).detach() & (self._mass(self.width) > 1e-35).detach()
+
+    def _corner_sum(self) -> Tensor:
+        z = torch.where(self.visible, self.distance, 1.0)
+
+        def term(x: Tensor, y: Tensor) -> Tensor:
+            return torch.atan2(x * y, z * torch.sqrt(x * x + y * y + z * z))
+
+        x0, x1, y0, y1 = self.x0, self.x0 + self.width, self.y0, self.y0 + self.height
+        return term(x1, y1) - term(x0, y1) - term(x1, y0) + term(x0, y0)
 
     def _mass(self, width: Tensor) -> Tensor:
         """Solid angle of the part up to `x0 + width`."""
