@@ -126,7 +126,7 @@ def camera_of(config: Config, strands: Strands) -> Camera:
     target: Any = c.target
     if position is None:
         away = c.direction or VIEWS.get(config.geometry.kind, (0.35, 0.25, 1.0))
-        seen, middle, _, _ = suggested_view(strands, away, c.fov_deg)
+        seen, middle, _, _ = suggested_view(strands, away, c.fov_deg, aspect=min(1.0, c.width / c.height))
         target = middle if target is None else torch.tensor(target, dtype=torch.float64)
         position = target + (seen - middle) * c.margin
     elif target is None:

@@ -18,6 +18,7 @@ from dsfit.experiment.schema_render import Generator
 from dsfit.experiment.validation import load
 from dsfit.render.geometry import GENERATORS, write_hair
 
+SHIPPED = sorted((Path(__file__).parents[2] / "configs").glob("render_*.toml"))
 CONFIG = """
 kind = "render"
 [bsdf]
@@ -156,7 +157,7 @@ def test_errors_name_the_key(tmp_path: Path, change: str, named: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "configs").glob("render_*.toml")), ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda p: p.stem)
 def test_shipped_scenes_load(path: Path) -> None:
     if path.stem != "render_base":
         assert load(path).config.kind in ("render", "compare_render")

@@ -134,12 +134,12 @@ def test_without_disorder_strands_are_straight() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("direction", [None, (1.0, -0.5, -0.3)])
-def test_suggested_view_sees_every_strand(name: str, direction: tuple[float, ...] | None) -> None:
-    """Every point is in front of the camera and inside a square picture, which they nearly fill."""
+@pytest.mark.parametrize(("direction", "aspect"), [(None, 1.0), ((1.0, -0.5, -0.3), 1.0), (None, 0.4), (None, 2.5)])
+def test_suggested_view_sees_every_strand(name: str, direction: tuple[float, ...] | None, aspect: float) -> None:
+    """Every point is in front of the camera and inside the picture, which they nearly fill."""
     assert sorted(VIEWS) == NAMES
     hair = GENERATORS[name](**SMALL[name])
-    position, target, up, fov = suggested_view(hair, VIEWS[name] if direction is None else direction)
+    position, target, up, fov = suggested_view(hair, VIEWS[name] if direction is None else direction, aspect=aspect)
     forward = (target - position) / (target - position).norm()
     right = torch.linalg.cross(forward, up)
     right = right / right.norm()
@@ -147,7 +147,7 @@ def test_suggested_view_sees_every_strand(name: str, direction: tuple[float, ...
     points = hair.points - position
     depth = points @ forward
     assert bool((depth > 0).all())
-    plane = torch.stack([points @ right, points @ over], -1) / depth[:, None] / math.tan(math.radians(fov) / 2)
+    plane = torch.stack([points @ right / aspect, points @ over], -1) / depth[:, None] / math.tan(math.radians(fov) / 2)
     assert 0.88 < float(plane.abs().max()) < 1.0
 
 
@@ -207,6 +207,7 @@ def test_double_block_wants_two_counts(strands: Any) -> None:
         ("fov_deg", 0.0),
         ("fov_deg", 180.0),
         ("margin", 0.5),
+        ("aspect", 0.0),
     ],
 )
 def test_bad_views(field: str, value: Any) -> None:

@@ -38,7 +38,7 @@ def _rotate(numbers: list[float]) -> np.ndarray | None:
     axis = _unit(np.array(numbers[1:]))
     if axis is None:
         return None
-    angle = math.radians(math.fmod(numbers[0], 360.0))
+    angle = math.radians(numbers[0])
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     matrix = np.eye(4)
