@@ -36,6 +36,13 @@ def honest(cell: dict[str, Any]) -> bool:
     return not cell["biased"] and not cell["heavy"]
 
 
+def samples_light(cell: dict[str, Any]) -> bool:
+    """Whether part of the technique's samples go to the light."""
+    options = cell["options"]
+    own = {"best_mix": options.get("light_sampling", True), "guided": options.get("lights", 1), "light": True}
+    return number(cell["light"]) > 0 or bool(own.get(cell["kind"], False))
+
+
 def rows(result: dict[str, Any]) -> list[dict[str, Any]]:
     """One row per technique.
 
@@ -77,10 +84,10 @@ def _target(cell: dict[str, Any], cells: list[dict[str, Any]], target: float) ->
         return ratio(min(known, key=lambda t: t.seconds), own) if known else _NO_TIME
 
     def alike(c: dict[str, Any]) -> bool:
-        return c["uniforms"] == cell["uniforms"] and (number(c["light"]) > 0) == (number(cell["light"]) > 0)
+        return c["uniforms"] == cell["uniforms"] and samples_light(c) == samples_light(cell)
 
     def plain(c: dict[str, Any]) -> bool:
-        return c["uniforms"] == "random" and number(c["light"]) == 0
+        return c["uniforms"] == "random" and not samples_light(c)
 
     return {
         "prepared": own,

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from dsfit.experiment.schema_render import Technique
 
 FOLDER = "proposals-cache"
+TRAINED = ("amortised", "guided")
+"""Techniques of a rendering that draw from an amortised proposal."""
 _TRAINING_CODE = ("bsdf", "fit", "proposals", "scene")
 """Packages that training runs through: a change to others leaves the cache as it is."""
 
@@ -80,7 +82,7 @@ def _facts(path: Path) -> dict[str, Any]:
 
 def is_trained(technique: Technique) -> bool:
     """Whether a technique asks for a training before the first tile."""
-    return technique.kind == "amortised" and bool(technique.options.get("train")) and not technique.options.get("file")
+    return technique.kind in TRAINED and bool(technique.options.get("train")) and not technique.options.get("file")
 
 
 def with_proposal(technique: Technique, path: Path) -> Technique:

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from dsfit.experiment.compare_render_summary import painted, reference_of
+from dsfit.experiment.compare_render_summary import painted, reference_of, samples_light
 from dsfit.experiment.files import number
 from dsfit.experiment.plots.style import COLORS, new_figure, short
 
@@ -41,7 +41,7 @@ def compare_curves(result: dict[str, Any]) -> Figure:
 
 def way(cell: dict[str, Any]) -> str:
     """What cells have in common that differ in their points and in light sampling only."""
-    return str([cell["kind"], {k: v for k, v in cell["options"].items() if k not in ("file", "file_seconds")}])
+    return str([cell["kind"], {k: v for k, v in cell["options"].items() if k != "light_sampling"}])
 
 
 def _style(cell: dict[str, Any], cells: list[dict[str, Any]]) -> dict[str, Any]:
@@ -52,7 +52,7 @@ def _style(cell: dict[str, Any], cells: list[dict[str, Any]]) -> dict[str, Any]:
         "color": COLORS[k % len(COLORS)],
         "marker": _MARKERS[k % len(_MARKERS)],
         "linestyle": ":" if cell["heavy"] else line,
-        "markerfacecolor": "white" if number(cell["light"]) else None,
+        "markerfacecolor": "white" if samples_light(cell) else None,
         "linewidth": 1.3,
         "markersize": 4.0,
         "markeredgewidth": 0.9,
