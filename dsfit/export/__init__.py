@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from dsfit.export.header import Header, header, write_example, write_header
+from dsfit.export.writer import Header, header, write_example, write_header
 
 __all__ = ["Header", "header", "write_example", "write_header"]

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from dsfit.errors import InputError
-from dsfit.export.header import write_example, write_header
 from dsfit.export.render import check_namespace
 from dsfit.export.sources import from_config, from_proposal
+from dsfit.export.writer import write_example, write_header
 
 
 def export(

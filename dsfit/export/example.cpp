@@ -32,7 +32,8 @@ int main() {
     bool good = true;
     auto check = [&](const char* name, double found, double expected, double error) {
         const bool ok = std::abs(found - expected) <= error;
-        std::printf("  %-22s %.6g, expected %.6g, within %.1g: %s\n", name, found, expected, error, ok ? "ok" : "WRONG");
+        const char* verdict = ok ? "ok" : "WRONG";
+        std::printf("  %-22s %.6g, expected %.6g, within %.1g: %s\n", name, found, expected, error, verdict);
         good = good && ok;
     };
     for (const hair::Known& known : hair::known) {

@@ -417,7 +417,8 @@ inline Context prepare(float theta_r, float n, float v) {
         const float ratio = std::exp(-static_cast<float>(std::abs(a - b)));
         m.energy[lobes - 1] = std::max(a, b) + std::log1p(ratio);
         const float share = (a < b ? ratio : 1.0f) / (1.0f + ratio);
-        for (int f = 0; f < 3; f++) m.shape(f)[lobes - 1] = between(far.shape(f)[last_far], near.shape(f)[last_near], share);
+        for (int f = 0; f < 3; f++)
+            m.shape(f)[lobes - 1] = between(far.shape(f)[last_far], near.shape(f)[last_near], share);
     }
 
     std::array<float, components> log_weight{};
@@ -453,8 +454,8 @@ inline float law_density(int law, Cell row, const Direction& d) {
     const Cell column = cell(d.phi * (2 * (nodes - 1) / two_pi), nodes);
     const std::uint16_t* q = law_table + law_start[law] + row.first * nodes + column.first;
     const float* scale = law_scale + law * law_rows + row.first;
-    return between(between(q[0], q[1], column.share) * scale[0], between(q[nodes], q[nodes + 1], column.share) * scale[1],
-                   row.share);
+    const float low = between(q[0], q[1], column.share), high = between(q[nodes], q[nodes + 1], column.share);
+    return between(low * scale[0], high * scale[1], row.share);
 }
 
 inline float density(const Context& context, const Direction& d) {
@@ -480,7 +481,7 @@ inline float density(const Context& context, const Direction& d) {
     return total / d.cos_i + sphere;
 }
 
-// x >= 0 whose upper tail of the normal law is y / 2, y in (0, 1]: two polynomials in -log(y (2 - y)) as in Giles (2010)
+// x >= 0 whose upper tail of the normal law is y / 2, y in (0, 1]: two polynomials in -log(y (2 - y)), Giles (2010)
 inline float upper_quantile(float y) {
     const float w = -std::log(std::max(y * (2.0f - y), 1e-14f));
     if (w < 6.25f) {
