@@ -52,8 +52,9 @@ def _others(data: dict[str, Any]) -> str:
     """Other treatments: bias, thin rays, exp(-n) against N = 0; and errors of the step."""
     names = list(data["rows"][0]["others"])
     lines = [
-        "Bias, n - N of rays with n <= 1, and mean exp(-n) less the share of N = 0, for the default (the own fibre "
-        "taken off, the sine with the term for its spread) and with one thing changed:\n",
+        "Bias, mean exp(-n) less the share of N = 0, and mean of (exp(-n) - [N = 0])², for the default (a quarter of a "
+        "voxel on, the own fibre taken off, the sine with the term for its spread), and with other starts, which keep "
+        "the own fibre, and the root of the mean square sine alone:\n",
         "| geometry | points | grid | default | " + " | ".join(names) + " |",
         "|---|---|---:|---|" + "---|" * len(names),
     ]
@@ -76,7 +77,7 @@ def _others(data: dict[str, Any]) -> str:
 
 
 def _short(row: dict[str, Any]) -> str:
-    return f"{row['mean_n'] / row['mean_N'] - 1:+.1%}, {row['few'][0]:+.3f}, {row['exp'] - row['zero']:+.3f}"
+    return f"{row['mean_n'] / row['mean_N'] - 1:+.1%}, {row['exp'] - row['zero']:+.3f}, {row['brier']['poisson']:.4f}"
 
 
 def _speed(data: dict[str, Any]) -> str:

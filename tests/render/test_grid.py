@@ -100,7 +100,7 @@ def test_rate_of_spread_tangents(spread: float, error: float) -> None:
     assert float((found - exact).square().mean()) < 0.5 * float((root - exact).square().mean())
 
 
-def test_a_fibre_adds_its_own_crossings_in_every_direction_alike() -> None:
+def test_a_fibre_adds_its_own_crossings() -> None:
     left = []
     for seed in range(8):
         tangent = unit(normal(3, seed=seed))
@@ -109,9 +109,9 @@ def test_a_fibre_adds_its_own_crossings_in_every_direction_alike() -> None:
         grid = DensityGrid.of(fibre, 30, step=0.125, mode="eager")
         origin = uniform(3, seed=seed) + 2 * grid.voxel * (uniform(40, 1, seed=9) - 0.5) * tangent
         direction = unit(normal(150, 3, seed=seed + 20))
-        steep = direction[torch.linalg.cross(direction, tangent.expand_as(direction)).norm(dim=-1) > 0.5]
-        left.append(grid.crossings(origin[:, None], steep).mean() / grid.own_crossings(torch.tensor(0.01)))
-    assert float(torch.stack(left).mean()) == pytest.approx(1.0, abs=0.05)
+        inside = direction[torch.linalg.cross(direction, tangent.expand_as(direction)).norm(dim=-1) > 0.15]
+        left.append(grid.crossings(origin[:, None], inside, 0.0).mean() / grid.own_crossings(torch.tensor(0.01)))
+    assert float(torch.stack(left).mean()) == pytest.approx(1.0, abs=0.08)  # spreads by 0.08, over eight
 
 
 def test_counts_of_the_geometry_on_average() -> None:
@@ -122,15 +122,19 @@ def test_counts_of_the_geometry_on_average() -> None:
     origin = torch.lerp(strands.points[segment], strands.points[segment + 1], uniform(count, 1))
     direction = unit(normal(count, 3, seed=5))
     exact = exact_crossings(strands, origin, direction, strands.strand_of_point[segment]).to(F64)
-    n = grid.crossings(origin, direction, strands.radius[segment])
+    n = grid.crossings(origin, direction)
     error = float((n - exact).std()) / math.sqrt(count)
     assert float((n - exact).mean()) == pytest.approx(0.0, abs=4 * error + 0.03 * float(exact.mean()))
+    # as from a fibre: how many meet none is right to the noise
+    free, none = torch.exp(-grid.crossings(origin, direction, strands.radius[segment])), (exact == 0).to(F64)
+    error = float((free - none).std()) / math.sqrt(count)
+    assert float((free - none).mean()) == pytest.approx(0.0, abs=4 * error + 0.01)
     # Poisson: the spread about n is its root
     thick = n > 0.5
     assert 0.7 < float(((n - exact)[thick] ** 2 / n[thick]).mean()) < 1.4
     # axes taken for one another are seen
     turned = DensityGrid(grid.moments.transpose(0, 1).contiguous(), grid.low, grid.voxel)
-    wrong = turned.crossings(origin, direction, strands.radius[segment])
+    wrong = turned.crossings(origin, direction)
     assert float((wrong - exact).square().mean()) > 1.3 * float((n - exact).square().mean())
 
 

@@ -75,8 +75,8 @@ def test_a_small_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     for row in data["rows"]:
         assert abs(row["mean_n"] - row["mean_N"]) < 5 * row["error"] + 0.1 * row["mean_N"]
         assert row["steps"]["0.25"] < row["steps"]["1"] < 0.1 * row["mean_n"]
-        kept = row["others"]["own fibre kept"]
-        assert row["mean_n"] < kept["mean_n"]
+        assert row["others"]["half a voxel on"]["mean_n"] < row["others"]["from the point itself"]["mean_n"]
+        assert row["mean_n"] < row["others"]["root of the mean square sine"]["mean_n"]
     assert all(least > 0 for row in data["speed"] for least in row["nanoseconds"].values())
     printed = capsys.readouterr().out
     assert printed.count("| double_block |") == 2 * 6 + 2 and "nan" not in printed

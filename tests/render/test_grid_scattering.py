@@ -113,7 +113,7 @@ def test_table_holds_n_at_its_points() -> None:
     x, y, z = table.n.shape[:3]
     points = [torch.linspace(float(grid.low[a]), float(grid.high[a]), k, dtype=F64) for a, k in enumerate((x, y, z))]
     place, d = torch.stack([points[0][1], points[1][2], points[2][3]]), directions(3, 6)
-    wanted = grid.crossings(place, d)
+    wanted = grid.crossings(place, d, 0.0)
     assert torch.allclose(table.at(place), wanted, rtol=1e-4, atol=1e-4)
     assert torch.allclose(table.crossings(place.expand(3, 6, 3), d), wanted, rtol=1e-4, atol=1e-4)
     half = torch.stack([(points[0][1] + points[0][2]) / 2, points[1][2], points[2][3]])
@@ -127,7 +127,7 @@ def test_table_is_close_to_the_march_in_hair() -> None:
     grid = DensityGrid.of(strands, 24)
     origin = strands.points[torch.arange(0, len(strands.points), 37)]
     d = normal(len(origin), 3, seed=2)
-    n, table = grid.crossings(origin, d), grid.directional(lattice=12, rows=8, columns=16)
+    n, table = grid.crossings(origin, d, 0.0), grid.directional(lattice=12, rows=8, columns=16)
     found = table.crossings(origin, d)
     assert float((found - n).abs().mean()) < 0.2 * float(n.mean())
     assert float((found - n).square().mean()) < 0.2 * float(n.var())
@@ -135,13 +135,15 @@ def test_table_is_close_to_the_march_in_hair() -> None:
 
 def test_hints_are_the_sphere_averages_of_scattering() -> None:
     grid = homogeneous(torch.eye(3, dtype=F64) * 0.3, (12, 10, 8), mode="auto")
-    position = _positions(grid)
+    # where no ray leaves at once: at the border n jumps, and with it v of the third rule
+    position = 0.7 * _positions(grid) + 0.3 * (grid.low + grid.high) / 2
     table = grid.directional(lattice=20, rows=16, columns=32)
     for rule in ("poisson", "threshold", 0.25):
         n, v = table.hints(position, rule)
         exact = GridScattering(grid, hits_at(position, radius=1e-9), rule).hints(_context(torch.arange(HITS)))
         assert torch.allclose(n, exact.n, rtol=0.03, atol=0.01)
-        assert torch.allclose(v, exact.v, rtol=0.03, atol=0.02)
+        # n jumps over 1/2 in whole rows and columns of directions
+        assert torch.allclose(v, exact.v, rtol=0.03, atol=0.04 if rule == "threshold" else 0.01)
 
 
 def test_hints_everywhere() -> None:

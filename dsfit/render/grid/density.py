@@ -20,7 +20,7 @@ from dsfit.errors import (
     check_range,
 )
 from dsfit.render.grid.deposit import deposit
-from dsfit.render.grid.march import SELF, march
+from dsfit.render.grid.march import SELF, START, march
 from dsfit.render.grid.native import Compiled, NoCompiler
 from dsfit.render.strands import Strands
 
@@ -153,10 +153,11 @@ class DensityGrid:
         Args:
             origin: `[*, 3]`, in world coordinates, inside or outside; broadcast with `direction`.
             direction: `[*, 3]`, normalised here.
-            radius: of the fibre that the origin lies on, >= 0, `[*]`: the fibre is in the density too and would be
-                crossed by itself. In a field that voxels of side a smear out, a straight fibre of radius r adds the
-                same in every direction, n_own = 2 r c / a, c = 0.386; that is taken off, down to 0 at the least. None:
-                nothing is taken off.
+            radius: of the fibre that the origin lies on, >= 0, `[*]`. The ray then starts a quarter of a voxel on
+                (`march.START`): the density just there is smeared from further in. And the fibre itself is in the
+                density: in a field smeared over voxels of side a, a straight fibre of radius r adds the same, on
+                average, in every direction, n_own = 2 r c / a with c = 0.276; that is taken off, down to 0 at the
+                least. None: the ray starts at the origin, and nothing is taken off.
 
         The result has the rays' common dtype. Gradients flow to origin, direction and moments.
 
@@ -171,15 +172,15 @@ class DensityGrid:
         dtype = torch.promote_types(origin.dtype, direction.dtype)
         if radius is not None:
             radius = check_range("radius", as_real("radius", radius), 0.0)
-        own = None if radius is None else self.own_crossings(radius).to(dtype)
+        own, begin = (None, 0.0) if radius is None else (self.own_crossings(radius).to(dtype), START)
         given = (origin, direction, self.moments, *([] if own is None else [own]))
         asked = torch.is_grad_enabled() and any(x.requires_grad for x in given)
         if self.mode == "compiled" and asked:
             raise InputError("mode", "compiled", "'auto' or 'eager' where gradients are asked for")
         if self.backend == "compiled" and not asked:
-            n = self.compiled.march(origin.expand(shape), direction.expand(shape)).to(dtype)
+            n = self.compiled.march(origin.expand(shape), direction.expand(shape), begin).to(dtype)
         else:
-            n = march(self, origin.to(dtype).expand(shape), direction.to(dtype).expand(shape))
+            n = march(self, origin.to(dtype).expand(shape), direction.to(dtype).expand(shape), begin)
         return n if own is None else (n - own).clamp_min(0.0)
 
     def own_crossings(self, radius: Tensor) -> Tensor:

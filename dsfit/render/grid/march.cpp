@@ -55,19 +55,20 @@ INLINE void turn(V* rows) {
 
 struct Ray { float start[3], d[3], enter, leave; };
 
-// Coordinates in voxels, centres at 1 to the number of them; the box [0, size - 1] is where the field is not zero.
-INLINE Ray ray_of(const Field& f, const float* origin, const float* direction) {
+// Coordinates in voxels, centres at 1 to the number of them; the box [0, size - 1] is where the field is not zero. The
+// ray is marched from `begin` voxels on.
+INLINE Ray ray_of(const Field& f, const float* origin, const float* direction, float begin) {
     Ray r;
     float square = 0;
     for (int a = 0; a < 3; a++) square += direction[a] * direction[a];
     float scale = 1.0f / __builtin_sqrtf(square);
-    float enter = 0, leave = INFINITY;
+    float enter = begin, leave = INFINITY;
     for (int a = 0; a < 3; a++) {
         r.start[a] = (origin[a] - f.low[a]) * f.inverse + 0.5f;
         r.d[a] = direction[a] * scale;
         float top = (float)(f.size[a] - 1);
         if (r.d[a] == 0) {
-            if (r.start[a] < 0 || r.start[a] > top) leave = -1;
+            if (r.start[a] < 0 || r.start[a] > top) leave = -INFINITY;
             continue;
         }
         float inverse = 1.0f / r.d[a], one = -r.start[a] * inverse, two = (top - r.start[a]) * inverse;
@@ -142,20 +143,21 @@ INLINE float march(const Field& f, const Ray& r) {
     return n * (f.step * f.voxel);
 }
 
-extern "C" void dsfit_march(const Field* field, const float* origin, const float* direction, int64_t count, float* n) {
+extern "C" void dsfit_march(const Field* field, const float* origin, const float* direction, float begin, int64_t count,
+                            float* n) {
     const Field f = *field;
-    for (int64_t i = 0; i < count; i++) n[i] = march(f, ray_of(f, origin + 3 * i, direction + 3 * i));
+    for (int64_t i = 0; i < count; i++) n[i] = march(f, ray_of(f, origin + 3 * i, direction + 3 * i, begin));
 }
 
 // Rays from the points of hits in directions (theta, phi) of their frames [H][3][3], rows tangent, normal, binormal.
 extern "C" void dsfit_march_hits(const Field* field, const float* positions, const float* frames, const int64_t* hit,
-                                 const float* theta, const float* phi, int64_t count, float* n) {
+                                 const float* theta, const float* phi, float begin, int64_t count, float* n) {
     const Field f = *field;
     for (int64_t i = 0; i < count; i++) {
         const float* frame = frames + 9 * hit[i];
         float c = std::cos(theta[i]), u = std::sin(theta[i]), v = c * std::cos(phi[i]), w = c * std::sin(phi[i]);
         float d[3];
         for (int a = 0; a < 3; a++) d[a] = u * frame[a] + v * frame[3 + a] + w * frame[6 + a];
-        n[i] = march(f, ray_of(f, positions + 3 * hit[i], d));
+        n[i] = march(f, ray_of(f, positions + 3 * hit[i], d, begin));
     }
 }

@@ -16,17 +16,23 @@ if TYPE_CHECKING:
 SPREAD = 3 * (1 - math.pi / 4 * math.sqrt(3 / 2))
 """k of `DensityGrid`: makes isotropic tangents exact."""
 
-SELF = 0.386
-"""c of `DensityGrid.crossings`: half the density, on a plane through its centre, of what cutting at the faces of a
-voxel and interpolating between voxels make of a point (a quadratic B-spline along each axis, in voxels); mean over
-planes, which spread by 0.02. (A normal distribution of the same variance, 1/4, has 0.399.)"""
+START = 0.25
+"""Voxels that rays from points on fibres leave out at first. Densities are smeared over a voxel or two, and points on
+fibres, above all those that are seen, have less in front of them than that. Among 0, 1/4, 0.35 and 1/2, a quarter has
+the least mean square error of exp(-n) against whether the exact number of crossings is 0, in blocks, curtains and balls
+of hair, or comes within 1 % of it; from 0 to 1/4 the error of the mean falls to a third."""
+
+SELF = 0.276
+"""c of `DensityGrid.crossings`: what is left beyond that start of the crossings that a straight fibre with r = a / 2
+has with itself, mean over directions and places of the voxels' faces (they spread by 0.02)."""
 
 _SAMPLES = 1 << 18
 """Points of rays that are held at once."""
 
 
-def march(grid: DensityGrid, origin: Tensor, direction: Tensor) -> Tensor:
-    """n `[*]` of rays `[*, 3]` of one dtype. Memory is bounded: rays go in chunks, which a gradient computes again."""
+def march(grid: DensityGrid, origin: Tensor, direction: Tensor, begin: float = 0.0) -> Tensor:
+    """n `[*]` of rays `[*, 3]` of one dtype, from `begin` voxels on. Memory is bounded: rays go in chunks, which a
+    gradient computes again."""
     shape = origin.shape[:-1]
     field = pad(grid.moments.to(origin.dtype).permute(3, 0, 1, 2), (1, 1, 1, 1, 1, 1)).unsqueeze(0)
     most = math.ceil(math.hypot(*(size + 1 for size in grid.shape)) / grid.step)
@@ -34,18 +40,20 @@ def march(grid: DensityGrid, origin: Tensor, direction: Tensor) -> Tensor:
     chunks = list(zip(origin.reshape(-1, 3).split(rays), direction.reshape(-1, 3).split(rays), strict=True))
     again = len(chunks) > 1 and torch.is_grad_enabled()
     parts = [
-        checkpoint(_march, grid, field, *chunk, use_reentrant=False) if again else _march(grid, field, *chunk)
+        checkpoint(_march, grid, field, begin, *chunk, use_reentrant=False)
+        if again
+        else _march(grid, field, begin, *chunk)
         for chunk in chunks
     ]
     return (torch.cat(parts) if parts else origin.new_zeros(0)).reshape(shape)
 
 
-def _march(grid: DensityGrid, field: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
+def _march(grid: DensityGrid, field: Tensor, begin: float, origin: Tensor, direction: Tensor) -> Tensor:
     """Sum of q(d) at the middles of steps, `[N]`; coordinates are voxels, with centres at 1 to the number of them."""
     d = direction / direction.norm(dim=-1, keepdim=True)
     start = (origin - grid.low.to(origin)) / grid.voxel + 0.5
     top = torch.tensor([size + 1.0 for size in grid.shape], dtype=origin.dtype)
-    enter, leave = _interval(start, d, top)
+    enter, leave = _interval(start, d, top, begin)
     steps = torch.ceil((leave - enter).detach() / grid.step).long()
     ray = torch.arange(len(steps)).repeat_interleave(steps)
     turn = torch.arange(len(ray)) - (steps.cumsum(0) - steps)[ray]
@@ -60,16 +68,16 @@ def _march(grid: DensityGrid, field: Tensor, origin: Tensor, direction: Tensor) 
     return n.clamp_max(grid.max_n)
 
 
-def _interval(start: Tensor, d: Tensor, top: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays enter and leave the box [0, top], from 0 on; the same number twice where they miss it."""
+def _interval(start: Tensor, d: Tensor, top: Tensor, begin: float) -> tuple[Tensor, Tensor]:
+    """Where rays enter and leave the box [0, top], from `begin` on; the same number twice where they miss it."""
     flat = d == 0
     inverse = 1 / torch.where(flat, 1.0, d)
     one, two = -start * inverse, (top - start) * inverse
     clear = (start >= 0) & (start <= top)
     near = torch.where(flat, torch.where(clear, -torch.inf, torch.inf), torch.minimum(one, two)).amax(-1)
     far = torch.where(flat, torch.where(clear, torch.inf, -torch.inf), torch.maximum(one, two)).amin(-1)
-    hit = far > near.clamp_min(0.0)
-    return torch.where(hit, near, 0.0).clamp_min(0.0), torch.where(hit, far, 0.0)
+    hit = far > near.clamp_min(begin)
+    return torch.where(hit, near, begin).clamp_min(begin), torch.where(hit, far, begin)
 
 
 def crossing_rate(moments: Tensor, d: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from dsfit.kernels.compiler import NoCompiler, built
-from dsfit.render.grid.march import SPREAD
+from dsfit.render.grid.march import SPREAD, START
 
 __all__ = ["Compiled", "NoCompiler"]
 
@@ -37,8 +37,8 @@ def library() -> ctypes.CDLL:
         NoCompiler: there is no compiler, or it fails.
     """
     code = built(_SOURCE.read_text())
-    code.dsfit_march.argtypes = (c_void_p, c_void_p, c_void_p, c_int64, c_void_p)
-    code.dsfit_march_hits.argtypes = (*[c_void_p] * 6, c_int64, c_void_p)
+    code.dsfit_march.argtypes = (c_void_p, c_void_p, c_void_p, c_float, c_int64, c_void_p)
+    code.dsfit_march_hits.argtypes = (*[c_void_p] * 6, c_float, c_int64, c_void_p)
     code.dsfit_march.restype = code.dsfit_march_hits.restype = None
     return code
 
@@ -58,22 +58,22 @@ class Compiled:
         """Bytes."""
         return self.moments.numel() * self.moments.element_size()
 
-    def march(self, origin: Tensor, direction: Tensor) -> Tensor:
-        """n `[*]` float32 of rays `[*, 3]`."""
+    def march(self, origin: Tensor, direction: Tensor, begin: float = 0.0) -> Tensor:
+        """n `[*]` float32 of rays `[*, 3]`, from `begin` voxels on."""
         origin, direction = _plain(origin), _plain(direction)
         n = origin.new_empty(origin.shape[:-1])
         address = ctypes.addressof(self.field)
-        self.code.dsfit_march(address, origin.data_ptr(), direction.data_ptr(), n.numel(), n.data_ptr())
+        self.code.dsfit_march(address, origin.data_ptr(), direction.data_ptr(), begin, n.numel(), n.data_ptr())
         return n
 
     def march_hits(self, position: Tensor, frame: Tensor, hit: Tensor, theta: Tensor, phi: Tensor) -> Tensor:
         """n `[*]` float32 in directions theta, phi `[*]` of the frames `[H, 3, 3]` at positions `[H, 3]`, both float32
-        and contiguous; hit `[*]` int64 says which."""
+        and contiguous; hit `[*]` int64 says which. Rays start as those from points on fibres do."""
         hit, theta, phi = hit.contiguous(), _plain(theta), _plain(phi)
         n = torch.empty_like(theta)
         given = (position, frame, hit, theta, phi)
         self.code.dsfit_march_hits(
-            ctypes.addressof(self.field), *(x.data_ptr() for x in given), n.numel(), n.data_ptr()
+            ctypes.addressof(self.field), *(x.data_ptr() for x in given), START, n.numel(), n.data_ptr()
         )
         return n
 

@@ -18,7 +18,7 @@ from dsfit.scene.scattering import Scattering
 class GridScattering(Scattering):
     """n(omega_i) by a ray from the hit's position through the grid, in the world direction frame^T omega_i.
 
-    The hit's own fibre is taken off the density; see `DensityGrid.crossings`.
+    Rays start a little away from the hit, whose own fibre is taken off; see `DensityGrid.crossings`.
 
     Args:
         grid: the density.

@@ -32,7 +32,8 @@ def directions(rows: int, columns: int) -> Tensor:
 
 @dataclass(frozen=True)
 class DirectionalTable:
-    """n at lattice points x directions. An approximation, to guide sampling; not what an image should be made of.
+    """n at lattice points x directions, of rays as from fibres of no width. An approximation, to guide sampling; not
+    what an image should be made of.
 
     Attributes:
         n: `[X, Y, Z, rows, columns]` float32; points on the corners of the box and evenly between, directions as in
@@ -61,7 +62,7 @@ class DirectionalTable:
         ]
         points = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
         with torch.no_grad():
-            n = grid.crossings(points[..., None, None, :].float(), directions(rows, columns).float())
+            n = grid.crossings(points[..., None, None, :].float(), directions(rows, columns).float(), 0.0)
         return cls(n, grid.low, grid.high)
 
     @property
