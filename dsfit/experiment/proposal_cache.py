@@ -15,6 +15,7 @@ from dsfit.experiment.amortised_method import loaded
 from dsfit.experiment.provenance import sources_hash
 from dsfit.experiment.schema import SCHEMA_VERSION
 from dsfit.experiment.store import save_proposal
+from dsfit.race.clock import timed
 
 if TYPE_CHECKING:
     from dsfit.bsdf import DualScattering
@@ -51,8 +52,8 @@ def cached_proposal(
         folder: of run directories.
 
     Returns:
-        The file, for `dsfit.load_proposal`, and `seconds` (of the training, whenever it was), its `parts`, `steps`,
-        `contexts`, and `found`: whether it was there already.
+        The file, for `dsfit.load_proposal`, and `seconds` (CPU seconds of the training, whenever it was),
+        `wall_seconds` of its parts, `steps`, `contexts`, and `found`: whether it was there already.
 
     Raises:
         InputError: an option that `dsfit.amortise` refuses.
@@ -67,8 +68,8 @@ def cached_proposal(
     from dsfit.fit.amortise import amortise
 
     say("training the proposal")
-    found = amortise(bsdf, **training)
-    spent = {"seconds": found.seconds["total"], "parts": found.seconds}
+    found, seconds = timed(lambda: amortise(bsdf, **training))
+    spent = {"seconds": seconds, "wall_seconds": found.seconds}
     facts = {**spent, "steps": found.steps, "contexts": found.contexts}
     save_proposal(path, found.proposal)
     files.write_json(path.with_suffix(".json"), {"schema_version": SCHEMA_VERSION, **facts})

@@ -35,7 +35,7 @@ def rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     ]
     if training := image["training"]:
         when = "by an earlier run" if training["found"] else "before the first tile"
-        found.append(("training", f"{_time(training['seconds'])}, {training['steps']} steps, {when}"))
+        found.append(("training, CPU", f"{_time(training['seconds'])}, {training['steps']} steps, {when}"))
     return [
         *found,
         ("tiles", f"{image['tiles']} of at most {render['tile']} x {render['tile']} pixels"),
