@@ -96,7 +96,11 @@ def turned(normal: Tensor, source: Tensor, target: Tensor) -> Tensor:
 
 def upright(normal: Tensor, tangent: Tensor) -> Tensor:
     """Unit vectors: the part of `normal` perpendicular to the unit tangent, orthogonal to rounding."""
-    other = perpendicular(tangent)
     for _ in range(2):  # the second pass removes what the first left by rounding
-        normal = unit(normal - (normal * tangent).sum(-1, keepdim=True) * tangent, other)
+        normal = normal - (normal * tangent).sum(-1, keepdim=True) * tangent
+        length = normal.norm(dim=-1, keepdim=True)
+        if bool((length > _TURNED).all()):
+            normal = normal / length
+        else:
+            normal = unit(normal, perpendicular(tangent))
     return normal

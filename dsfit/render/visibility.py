@@ -13,7 +13,7 @@ from dsfit.render.camera import Camera
 from dsfit.render.hits import Hits
 from dsfit.render.pixel_samples import pixel_samples
 from dsfit.render.ribbons import Ribbons
-from dsfit.render.strand_frames import carried_normals, point_tangents, turned, unit, upright
+from dsfit.render.strand_frames import carried_normals, point_tangents, turned, unit
 from dsfit.render.strands import Strands
 
 _RAYS = 2**17
@@ -108,7 +108,7 @@ class Visibility:
 
         here = self._tangent[start]
         tangent = unit(between(self._tangent), here)
-        normal = upright(turned(self._normal[start], here, tangent), tangent)
+        normal = turned(self._normal[start], here, tangent)
         frame = torch.stack([tangent, normal, torch.linalg.cross(tangent, normal)], dim=-2)
         right = torch.linalg.cross(tangent, -direction)
         side = (right * between(self._ribbons.side)).sum(-1)

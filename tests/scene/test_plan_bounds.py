@@ -91,6 +91,21 @@ def test_every_term_is_between_its_bounds_for_a_poisson_number_of_fibres(seed: i
     assert violations(bounds_of(bsdf, context), direct_and_means(bsdf, context)) == []
 
 
+@pytest.mark.parametrize("n", [0.4, 20.0])
+def test_bounds_for_a_poisson_number_of_fibres_are_tight(n: float) -> None:
+    """Narrow lobes at grazing, where widths matter: every term within a factor of 2.5, and no violation."""
+    fiber = dsfit.Fiber(sigma_a=(0.3, 3.0), beta=torch.tensor([2.0, 1.0, 3.0], dtype=torch.float64) * DEG)
+    poisson = dsfit.Convention.named("consistent", transmittance="poisson")
+    bsdf = dsfit.DualScattering(fiber, azimuthal="simplified", convention=poisson)
+    context = dsfit.Context(torch.tensor(1.2, dtype=torch.float64), n=n, v=0.2)
+    bounds, truth = bounds_of(bsdf, context), direct_and_means(bsdf, context)
+    assert violations(bounds, truth) == []
+    assert bool((bounds.upper[0, :8] < 2.5 * truth).all())
+    single = SUBSETS[:, 4:].sum(1).eq(1) & SUBSETS[:, :4].sum(1).eq(0)
+    order = SUBSETS[single].argmax(1)
+    assert bool((bounds.kept[single, 0] > 0.4 * truth[order]).all())
+
+
 def direct_and_means(bsdf: dsfit.DualScattering, context: dsfit.Context) -> Tensor:
     """Integral of every term by one-dimensional quadrature over theta_i: azimuths integrated as energies.
 
