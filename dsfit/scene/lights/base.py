@@ -136,13 +136,13 @@ class Light(nn.Module, ABC):
         vector = to_vector(omega_i)
         if self.rotation is None:
             return vector
-        return (vector.unsqueeze(-2) @ self.rotation.to(vector)).squeeze(-2)
+        return _turned(vector, self.rotation.to(vector).mT)
 
     def to_fibre(self, vector: Tensor) -> Tensor:
         """Vectors `[..., 3]` from the light's frame into the fibre frame."""
         if self.rotation is None:
             return vector
-        return (vector.unsqueeze(-2) @ self.rotation.to(vector).mT).squeeze(-2)
+        return _turned(vector, self.rotation.to(vector))
 
     def single_frame(self) -> None:
         """Raise `InputError` if there is a batch of rotations."""
@@ -153,6 +153,15 @@ class Light(nn.Module, ABC):
 
     def extra_repr(self) -> str:
         return f"{self.label}, channels={self.channels}"
+
+
+def _turned(vector: Tensor, matrix: Tensor) -> Tensor:
+    """Matrices `[*batch, 3, 3]` times vectors `[..., 3]`; a batch by its elements: of such small ones matmul copies and
+    multiplies one by one."""
+    if matrix.dim() == 2:
+        return vector @ matrix.mT
+    x, y, z = vector.unbind(-1)
+    return torch.stack([x * m[..., 0] + y * m[..., 1] + z * m[..., 2] for m in matrix.unbind(-2)], dim=-1)
 
 
 def tidy(thetas: list[float], phis: list[float]) -> tuple[list[float], list[float]]:

@@ -144,24 +144,30 @@ class EnvironmentLight(Light):
     def _coordinates(self, omega_i: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Row interval k in 0 .. H (between nodes k and k + 1), place in it, column interval, place in it."""
         height, width, _ = self.image.shape
-        x, y, z = self.world_vector(omega_i).unbind(-1)
-        latitude, longitude = to_angles(torch.stack([y, z, x], dim=-1)).unbind(-1)
+        latitude, longitude = to_angles(self.world_vector(omega_i).roll(-1, -1)).unbind(-1)
         row = (_PI / 2 - latitude) * (height / _PI) - 0.5
         column = (_PI - longitude) * (width / (2 * _PI)) - 0.5
         k, j = torch.floor(row.detach()), torch.floor(column.detach())
         return (k.long() + 1).clamp(0, height), (row - k).clamp(0.0, 1.0), j.long() % width, column - j
 
-    def _corners(self, table: Tensor, k: Tensor, j: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        height, width = table.shape[:2]
-        above, below, right = (k - 1).clamp_min(0), k.clamp_max(height - 1), (j + 1) % width
-        return table[above, j], table[above, right], table[below, j], table[below, right]
+    def _corners(self, k: Tensor, j: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Places of the four texels around, in the flattened map."""
+        height, width = self.luminance.shape
+        above, below = (k - 1).clamp_min(0) * width, k.clamp_max(height - 1) * width
+        right = torch.where(j == width - 1, 0, j + 1)
+        return above + j, above + right, below + j, below + right
 
     def forward(self, omega_i: Tensor) -> Tensor:
         check_directions(omega_i, field="omega_i")
         k, t, j, s = self._coordinates(omega_i)
-        a, b, c, d = (x.to(omega_i) for x in self._corners(self.image, k, j))
-        t, s = t.unsqueeze(-1), s.unsqueeze(-1)
-        return self.scale * ((1 - t) * ((1 - s) * a + s * b) + t * ((1 - s) * c + s * d))
+        weights = ((1 - t) * (1 - s), (1 - t) * s, t * (1 - s), t * s)
+        corners = [place * self.channels for place in self._corners(k, j)]
+        # channel by channel: sums over a last dimension of three run at a fraction of the speed
+        found = [
+            sum(w * _at(self.image, place + channel).to(omega_i) for w, place in zip(weights, corners, strict=True))
+            for channel in range(self.channels)
+        ]
+        return self.scale * torch.stack(found, dim=-1)
 
     def power(self) -> Tensor:
         """The integral of the sampling density, which differs from that of the radiance by the square of a texel."""
@@ -212,6 +218,11 @@ def _direction(latitude: Tensor, longitude: Tensor) -> Tensor:
     return torch.stack([flat * torch.sin(longitude), torch.sin(latitude), flat * torch.cos(longitude)], dim=-1)
 
 
+def _at(table: Tensor, place: Tensor) -> Tensor:
+    """Elements of a flattened table; several times as fast as indexing rows and columns."""
+    return table.reshape(-1).index_select(0, place.reshape(-1)).reshape(place.shape)
+
+
 class EnvironmentProposal(Proposal):
     """Directions by the luminance of an environment map; two uniforms (sine of latitude, longitude)."""
 
@@ -246,23 +257,22 @@ class EnvironmentDistribution(LightDistribution):
         colatitude = 2 * torch.atan2(torch.sqrt(low.clamp_min(1e-300)), torch.sqrt(high.clamp_min(1e-300)))
 
         above, below = (k - 1).clamp_min(0), k.clamp_max(height - 1)
-        table = light.column_mass
+        upper, lower, rest = above * (width + 1), below * (width + 1), 1 - t
 
-        def mass(column: Tensor) -> Tensor:
-            return (1 - t) * table[above, column] + t * table[below, column]
+        def mass(column: Tensor | int) -> Tensor:
+            return rest * _at(light.column_mass, upper + column) + t * _at(light.column_mass, lower + column)
 
-        full = mass(torch.full_like(k, width))
+        full = mass(width)
         goal = torch.minimum(u1 * full, torch.nextafter(full.detach(), torch.zeros_like(full)))
-        first, last = torch.zeros_like(k), torch.full_like(k, width)
-        for _ in range(width.bit_length()):  # invariant: mass(first) <= goal < mass(last)
-            middle = (first + last) // 2
-            right = mass(middle).detach() <= goal.detach()
-            first, last = torch.where(right, middle, first), torch.where(right, last, middle)
+        first = torch.zeros_like(k)
+        for bit in reversed(range((width - 1).bit_length())):  # the last column with mass(column) <= goal
+            further = (first + (1 << bit)).clamp_max(width - 1)
+            first = torch.where(mass(further).detach() <= goal.detach(), further, first)
         start, end = mass(first), mass(first + 1)
-        values = light.luminance
-        after = (first + 1) % width
-        a = (1 - t) * values[above, first] + t * values[below, first]
-        b = (1 - t) * values[above, after] + t * values[below, after]
+        upper, lower = above * width, below * width
+        after = torch.where(first == width - 1, 0, first + 1)
+        a = rest * _at(light.luminance, upper + first) + t * _at(light.luminance, lower + first)
+        b = rest * _at(light.luminance, upper + after) + t * _at(light.luminance, lower + after)
         s = _linear_inverse(((goal - start) / (end - start)).clamp(0.0, 1.0), a, b)
         longitude = _PI - (first + s + 0.5) * (2 * _PI / width)
         flat = torch.sin(colatitude)
@@ -279,7 +289,7 @@ class EnvironmentDistribution(LightDistribution):
         # Place in the row measured in sin(latitude), from both ends, so that neither weight is lost to rounding.
         near = 2 * torch.sin(lower + t * step / 2) * torch.sin(t * step / 2) / light.rises[k]
         far = 2 * torch.sin(upper - (1 - t) * step / 2) * torch.sin((1 - t) * step / 2) / light.rises[k]
-        a, b, c, d = light._corners(light.luminance, k, j)
+        a, b, c, d = (_at(light.luminance, place) for place in light._corners(k, j))
         top = (1 - s) * a + s * b
         # The half rows at the poles hold one value, and t, counted in full rows, is not the place in them.
         polar = (k == 0) | (k == light.luminance.shape[0])

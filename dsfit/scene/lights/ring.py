@@ -121,8 +121,9 @@ class RingLight(NearbyLight):
         return self._outline().azimuth_edges(theta_i)
 
     def power(self) -> Tensor:
+        """By the solid angle from 17 values, see `SphericalRing`: to a few percent next to the ring, else exact."""
         ring, bright = self.seen_ring()
-        return torch.where(bright, ring.solid_angle * self.radiance.mean(), 0.0)
+        return torch.where(bright, ring.rough_angle * self.radiance.mean(), 0.0)
 
     def proposal(self) -> Proposal:
         """Nearly uniform in the ring's solid angle, with exact density; two uniforms."""

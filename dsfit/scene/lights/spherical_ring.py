@@ -81,10 +81,19 @@ class SphericalRing:
         return tuple(x.detach() for x in (h, d, torch.where(close, 0.0, d), e, *c, self.inner, self.outer, blur))
 
     @functools.cached_property
+    def _knots(self) -> Tensor:
+        """M at the knots of the table, `[*batch, K + 1]`."""
+        return self._masses(torch.linspace(0.0, 1.0, _KNOTS + 1, dtype=torch.float64, device=self.flat.device))
+
+    @functools.cached_property
+    def rough_angle(self) -> Tensor:
+        """The solid angle from the knots of the table alone: good enough to share out samples by."""
+        return torch.where(self.visible, _trapezoid(self._knots), 0.0)
+
+    @functools.cached_property
     def table(self) -> tuple[Tensor, Tensor]:
         """Values `[*batch, K + 1]` of the density of |x| per interval at its knots, and its integrals up to them."""
-        x = torch.linspace(0.0, 1.0, _KNOTS + 1, dtype=torch.float64, device=self.flat.device)
-        mass = torch.where(self.visible[..., None], self._masses(x), 1.0)
+        mass = torch.where(self.visible[..., None], self._knots, 1.0)
         value = mass + _FLOOR * mass.mean(-1, keepdim=True)
         steps = (value[..., 1:] + value[..., :-1]) / 2
         total = steps.sum(-1, keepdim=True)
@@ -96,9 +105,7 @@ class SphericalRing:
         """The ring's solid angle by the trapezoidal rule, `[*batch]`; 0 in the plane. Points farther off than a tenth
         of the radius have ten digits and more, points a thousandth from an edge three."""
         x = torch.linspace(0.0, 1.0, _NODES + 1, dtype=torch.float64, device=self.flat.device)
-        mass = self._masses(x)
-        whole = 2 * (mass.sum(-1) - (mass[..., 0] + mass[..., -1]) / 2) / _NODES
-        return torch.where(self.visible, whole, 0.0)
+        return torch.where(self.visible, _trapezoid(self._masses(x)), 0.0)
 
     def _masses(self, x: Tensor) -> Tensor:
         """M `[*batch, K]` at `x [K]`."""
@@ -253,6 +260,11 @@ class _Between:
         """1 - cos(chi) and 1 + cos(chi) where the share u of the mass lies inside."""
         (a, b), (c, d) = self.rises, self.falls
         return a + u * (b - a), c + u * (d - c)
+
+
+def _trapezoid(values: Tensor) -> Tensor:
+    """Integral over [-1, 1] of an even function by its values at even steps over [0, 1]."""
+    return 2 * (values.sum(-1) - (values[..., 0] + values[..., -1]) / 2) / (values.shape[-1] - 1)
 
 
 def _log_ratio(table: Tensor, mass: Tensor) -> Tensor:

@@ -15,7 +15,8 @@ from dsfit.context import Context
 from dsfit.errors import InputError, as_real, check_range
 from dsfit.proposals.base import Distribution, Proposal
 from dsfit.proposals.mixture import MixtureDistribution, log_sum_exp
-from dsfit.scene.lights.base import Light, tidy
+from dsfit.scene.lights.base import Light, LightDistribution, tidy
+from dsfit.scene.lights.nearby import NearbyLight
 
 
 class TotalLight(Light):
@@ -155,6 +156,11 @@ class TotalDistribution(MixtureDistribution):
 
     def log_prob(self, omega: Tensor) -> Tensor:
         return log_sum_exp(self.component_log_probs(omega) + self.log_weights.to(omega))
+
+    def _restrict(self, component: Distribution, index: Tensor) -> Distribution | None:
+        # What a nearby light prepares for one point takes longer than to draw from it everywhere.
+        nearby = isinstance(component, LightDistribution) and isinstance(component.light, NearbyLight)
+        return None if nearby and len(self.batch_shape) else super()._restrict(component, index)
 
     def select(self, take: Callable[[Tensor], Tensor]) -> TotalDistribution | None:
         components = [component.select(take) for component in self.components]
