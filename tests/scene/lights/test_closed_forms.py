@@ -69,7 +69,8 @@ def test_small_solid_angles_keep_their_digits() -> None:
         sheet = RectangleLight([x - flat, y - flat, z], [size, 0, 0], [0, size, 0], 1.0, two_sided=True)
         ring = RingLight(place, [0, 0, 1], flat, size, 1.0, two_sided=True)
         assert float(sheet.power()) == pytest.approx(size**2 * z / distance**3, rel=1e-6)
-        assert float(ring.seen_ring()[0].solid_angle) == pytest.approx(0.75 * math.pi * size**2 * z / distance**3, rel=1e-6)
+        wanted = 0.75 * math.pi * size**2 * z / distance**3
+        assert float(ring.seen_ring()[0].solid_angle) == pytest.approx(wanted, rel=1e-6)
 
 
 @pytest.mark.parametrize("height", [1e-3, 0.1, 1.0, 50.0])
