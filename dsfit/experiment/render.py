@@ -108,8 +108,7 @@ def render(
     say("scene")
     scene = scene_of(config)
     asked = config.render
-    key = (key_of(config), asked.technique.model_dump_json(), asked.seed, str(directory.path.resolve()))
-    technique = _technique(_Key(config, directory, key))
+    technique = _technique(_Key(config, directory, (key_of(config), asked.seed, *_technique_key(config, directory))))
     technique.prepare(scene)
     prepared = clock.read()
     top, left, bottom, right = identity["tile"]
@@ -129,6 +128,13 @@ def render(
         "peak_memory": peak_memory(),
     }
     return data, {name: getattr(tile, name).numpy() for name in _LAYERS}
+
+
+def _technique_key(config: Config, directory: RunDirectory) -> tuple[Any, ...]:
+    """Equal for equal techniques, as long as the proposal that was trained for them does not change."""
+    technique = config.render.technique
+    trained = proposal_path(directory) if is_trained(technique) else None
+    return technique.model_dump_json(), trained and (str(trained.resolve()), trained.stat().st_mtime_ns)
 
 
 def direction_seed(config: Config) -> int:

@@ -143,7 +143,8 @@ class RenderConfig(Section):
     Every pixel has `subsamples` camera rays; the hits get `passes` times `samples` directions, in independent passes,
     whose spread gives the variance. Tiles of `tile` x `tile` pixels are computed and stored one by one. `v` is the rule
     for the directly lit share. `exposure` is a factor on the radiance (left out: one that suits the image) and, as
-    `tone_map`, matters to the PNG alone.
+    `tone_map`, matters to the PNG alone. `seed` places the rays; the seed of the directions follows from it, the
+    samples, the passes and the technique, so that images of one seed differ in their noise alone.
     """
 
     subsamples: Annotated[int, Field(ge=1, le=1024)] = 16

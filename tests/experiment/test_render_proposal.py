@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -128,6 +129,14 @@ def test_a_resumed_run_keeps_its_proposal_even_if_the_cache_is_gone(config: Path
     directory.cell_path(0).unlink()
     runner.run(load(config), workers=0)
     assert len(trainings) == 2 and torch.equal(read_image(directory.path / "image.exr").radiance, before)
+
+
+def test_a_process_does_not_go_on_with_an_earlier_proposal(config: Path, trainings: list[Any]) -> None:
+    directory, one = runner.run(load(config), workers=0).directory, load(config).config
+    before = render._technique_key(one, directory)
+    assert render._technique_key(one, directory) == before
+    os.utime(render.proposal_path(directory), ns=(1, 1))
+    assert render._technique_key(one, directory) != before
 
 
 def test_damaged_or_unfinished_cache_files_are_made_again(
