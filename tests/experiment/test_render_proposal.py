@@ -164,7 +164,7 @@ def test_damaged_or_unfinished_cache_files_are_made_again(
 
 
 def test_a_file_of_another_fibre_under_the_name_is_not_taken(
-    config: Path, trainings: list[Any], tmp_path: Path
+    config: Path, trainings: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one, other = load(config).config, load(config, ['fiber.preset="black"']).config
     right, _ = cached_proposal(one, {}, tmp_path, quiet)
@@ -173,7 +173,13 @@ def test_a_file_of_another_fibre_under_the_name_is_not_taken(
     wrong.with_suffix(".json").write_bytes(right.with_suffix(".json").read_bytes())
     with pytest.raises(InputError):
         render.loaded(str(wrong), build.bsdf(other))
-    assert cached_proposal(other, {}, tmp_path, quiet)[1]["found"] is False
+
+    def trained(*_: Any, **__: Any) -> None:
+        raise RuntimeError("trained anew")
+
+    monkeypatch.setattr("dsfit.fit.amortise.amortise", trained)
+    with pytest.raises(RuntimeError, match="trained anew"):
+        cached_proposal(other, {}, tmp_path, quiet)
 
 
 def test_the_key_depends_on_all_that_is_trained(config: Path) -> None:
