@@ -31,10 +31,13 @@ class Visibility:
         camera: where it is seen from.
 
     Raises:
-        InputError: embreex is not installed, or there are more triangles than it can number.
+        InputError: no strands or no camera, embreex is not installed, or there are more triangles than it can number.
     """
 
     def __init__(self, strands: Strands, camera: Camera) -> None:
+        for field, given, kind in (("strands", strands, Strands), ("camera", camera, Camera)):
+            if not isinstance(given, kind):
+                raise InputError(field, type(given).__name__, f"a dsfit {kind.__name__}")
         embree, meshes = _embree()
         self.strands, self.camera = strands, camera
         self._ribbons = Ribbons.facing(strands, camera.position)

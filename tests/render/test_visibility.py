@@ -267,6 +267,9 @@ def test_bad_input() -> None:
     ):
         with pytest.raises(InputError, match=f"^{field}: got"):
             visibility.hits(*given)
+    for field, pair in (("strands", (torch.zeros(4, 3), camera)), ("camera", (visibility.strands, (0.0, 0.0, 7.0)))):
+        with pytest.raises(InputError, match=f"^{field}: got"):
+            Visibility(*pair)
     with pytest.raises(InputError, match="context.dtype"):
         context_of(visibility.hits(range(8), range(8), 1, 0), dtype=torch.float16)
 
