@@ -42,7 +42,7 @@ def compute(folder: Path, quick: bool) -> dict[str, Any]:
     from dsfit.experiment.files import write_json
     from dsfit.experiment.provenance import provenance
 
-    start, rays = time.perf_counter(), 60 if quick else 1200
+    start, rays = time.perf_counter(), 60 if quick else 1000
     rows, speed = [], []
     for name in GEOMETRIES[:2] if quick else GEOMETRIES:
         strands = _strands(name, quick)
