@@ -51,9 +51,9 @@ class DensityGrid:
         moments: `[X, Y, Z, 6]`, the components xx, yy, zz, xy, xz, yz of T per unit length; may require a gradient.
         low: `[3]`, lowest corner, in world coordinates.
         voxel: side of the cubic voxels, > 0.
-        step: of the march, as a fraction of the voxel, in [1/64, 1]. In hair, steps of a whole voxel err by 0.04 to 0.45
-            crossings (RMS) at a mean of 6 to 15, one way as often as the other; half a voxel by a third to a quarter
-            of that.
+        step: of the march, as a fraction of the voxel, in [1/64, 1]. In hair, steps of a whole voxel err by 0.04 to
+            0.45 crossings (RMS) at a mean of 6 to 15, one way as often as the other; half a voxel by a third to a
+            quarter of that.
         max_n: crossings are limited to this number, > 0; the light is gone there.
         mode: "compiled" (C++ in float32, built for this machine at first use; no gradients), "eager" (torch, in the
             dtype of the ray), or "auto": compiled where no gradient is asked for and there is a compiler.
