@@ -42,6 +42,16 @@ class TilePixels:
     seconds: float
 
 
+@dataclass(frozen=True)
+class Accumulated:
+    """Mean over passes of what the hits add to each pixel and its variance `[P, C]`, and the sum `[P]` of the hits'
+    hints n."""
+
+    mean: Tensor
+    variance: Tensor
+    hint: Tensor
+
+
 def render_tile(
     scene: RenderScene,
     technique: Technique,
@@ -66,27 +76,42 @@ def render_tile(
         InputError: arguments out of range; an estimate that is not finite (names technique and pixel).
     """
     start = time.process_time()
-    _check(scene, rows, columns, samples=samples, passes=passes)
+    check_tile(scene, rows, columns, samples=samples, passes=passes)
     technique.prepare(scene)
     hits = scene.hits(rows, columns)
-    radiance, variance, hint = _passes(scene, technique, hits, rows, columns, samples, passes, seed)
-    shape, counts = (len(rows), len(columns)), torch.bincount(hits.pixel, minlength=len(rows) * len(columns))
+    names = pixel_names(scene, rows, columns)
+    found = accumulate(scene, technique, hits, names, samples, range(passes), seed)
+    count = torch.full((len(names),), samples * passes)
+    return tile_of(scene, hits, (len(rows), len(columns)), found, count, start)
+
+
+def pixel_names(scene: RenderScene, rows: range, columns: range) -> Tensor:
+    """The numbers `[P]` of a tile's pixels in the picture."""
+    return (torch.tensor(rows)[:, None] * scene.camera.width + torch.tensor(columns)).reshape(-1)
+
+
+def tile_of(
+    scene: RenderScene, hits: Hits, shape: tuple[int, int], found: Accumulated, samples: Tensor, start: float
+) -> TilePixels:
+    """The tile's layers from what its hits add up to and the directions per hit `[P]`."""
+    counts = torch.bincount(hits.pixel, minlength=len(samples))
     missed = 1 - counts / scene.subsamples
-    radiance = radiance + missed.unsqueeze(-1) * scene.background
+    radiance = found.mean + missed.unsqueeze(-1) * scene.background
     some = counts.clamp_min(1)
     depth = torch.zeros(len(counts), dtype=torch.float64).index_add_(0, hits.pixel, hits.depth.double()) / some
     return TilePixels(
         radiance.reshape(*shape, -1),
-        variance.reshape(*shape, -1),
-        (counts * samples * passes).reshape(shape),
-        (hint / some).reshape(shape),
+        found.variance.reshape(*shape, -1),
+        (counts * samples).reshape(shape),
+        (found.hint / some).reshape(shape),
         (counts / scene.subsamples).double().reshape(shape),
         depth.reshape(shape),
         time.process_time() - start,
     )
 
 
-def _check(scene: RenderScene, rows: range, columns: range, **counts: int) -> None:
+def check_tile(scene: RenderScene, rows: range, columns: range, **counts: int) -> None:
+    """Refuse pixels that the picture does not have, and numbers of samples (>= 1) and passes (>= 2)."""
     for name, given, size in (("rows", rows, scene.camera.height), ("columns", columns, scene.camera.width)):
         if not isinstance(given, range) or not len(given) or given[0] < 0 or given[-1] >= size or given.step != 1:
             raise InputError(name, given, f"a range of pixels within 0 .. {size - 1}")
@@ -96,15 +121,12 @@ def _check(scene: RenderScene, rows: range, columns: range, **counts: int) -> No
             raise InputError(name, value, f"an integer >= {least}")
 
 
-def _passes(
-    scene: RenderScene, technique: Technique, hits: Hits, rows: range, columns: range, samples: int, passes: int,
-    seed: int,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean and variance of the mean `[P, C]` of what the hits add to each pixel, and the sum `[P]` of their hints n."""
-    pixels = len(rows) * len(columns)
-    mean, scatter = (torch.zeros(pixels, scene.channels, dtype=torch.float64) for _ in range(2))
-    hint = torch.zeros(pixels, dtype=torch.float64)
-    names = (torch.tensor(rows)[:, None] * scene.camera.width + torch.tensor(columns)).reshape(-1)
+def accumulate(
+    scene: RenderScene, technique: Technique, hits: Hits, names: Tensor, samples: int, passes: range, seed: int
+) -> Accumulated:
+    """What the hits add to the pixels called `names` in these passes, one group of hits after another."""
+    mean, scatter = (torch.zeros(len(names), scene.channels, dtype=torch.float64) for _ in range(2))
+    hint = torch.zeros(len(names), dtype=torch.float64)
     for some in groups(hits.pixel):
         part = hits[some]
         contexts = scene.contexts(part)
@@ -112,13 +134,14 @@ def _passes(
         sampler = technique.at(part, contexts, names[part.pixel])
         first, last = int(part.pixel[0]), int(part.pixel[-1]) + 1
         own = part.pixel - first
-        for k in range(passes):
-            found = estimate(sampler, technique, names[part.pixel], samples, scene.camera.width, pass_seed(seed, k))
+        for k, number in enumerate(passes):
+            number = pass_seed(seed, number)
+            found = estimate(sampler, technique, names[part.pixel], samples, scene.camera.width, number)
             value = mean.new_zeros(last - first, scene.channels).index_add_(0, own, found) / scene.subsamples
             delta = value - mean[first:last]
             mean[first:last] += delta / (k + 1)
             scatter[first:last] += delta * (value - mean[first:last])
-    return mean, scatter / ((passes - 1) * passes), hint
+    return Accumulated(mean, scatter / (max(len(passes) - 1, 1) * len(passes)), hint)
 
 
 def groups(pixel: Tensor, most: int = GROUP) -> list[slice]:

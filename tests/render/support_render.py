@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +12,8 @@ import torch
 import dsfit
 from dsfit.render.hits import Hits
 from dsfit.render.scene import RenderScene
-from dsfit.scene import ConstantScattering
+from dsfit.scene import ConstantLight, ConstantScattering
+from dsfit.scene.lights.sun import SunLight
 
 
 @dataclass(frozen=True)
@@ -77,3 +79,26 @@ def narrow_light(kappa: float = 200.0) -> Any:
 
     direction = torch.tensor([[math.sin(0.6), 0.5, math.cos(0.6)]], dtype=torch.float64)
     return VonMisesFisherLights(direction, kappa, 3.0, ambient=0.1)
+
+
+PIXEL = (range(1, 2), range(2, 3))
+
+
+@functools.cache
+def lit(kind: str):
+    lights = {
+        "furnace": ConstantLight([1.0, 2.0, 3.0]),
+        "sun": SunLight([0.5, 0.6, 0.7], 0.2, 1.0),
+        "lobe": narrow_light(),
+    }
+    return lights[kind]
+
+
+@functools.cache
+def pixel_truth(kind: str) -> torch.Tensor:
+    """The pixel's value `[C]` by quadrature in float64."""
+    one = scene(lit(kind), all_rays=True, dtype=torch.float64)
+    hits = one.hits(*PIXEL)
+    found = dsfit.reference(one.integrand(hits, exact=True), one.contexts(hits), 1e-6)
+    assert found.converged and len(hits) == 2
+    return found.value.mean(0)

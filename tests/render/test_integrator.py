@@ -4,43 +4,19 @@ picture from the same seed."""
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import pytest
 import torch
 
-import dsfit
 import dsfit.render.integrator as integrator
 from dsfit.errors import InputError
 from dsfit.race.density import DensitySampler
 from dsfit.race.peers.uniform import Uniform
 from dsfit.render.integrator import groups, render_tile
 from dsfit.render.techniques import Technique, technique
-from dsfit.scene import ConstantLight
-from dsfit.scene.lights.sun import SunLight
 from tests.render import support_render as support
 
-PIXEL = (range(1, 2), range(2, 3))
-
-
-@functools.cache
-def lit(kind: str):
-    lights = {
-        "furnace": ConstantLight([1.0, 2.0, 3.0]),
-        "sun": SunLight([0.5, 0.6, 0.7], 0.2, 1.0),
-        "lobe": support.narrow_light(),
-    }
-    return lights[kind]
-
-
-@functools.cache
-def pixel_truth(kind: str) -> torch.Tensor:
-    """The pixel's value `[C]` by quadrature in float64."""
-    scene = support.scene(lit(kind), all_rays=True, dtype=torch.float64)
-    hits = scene.hits(*PIXEL)
-    found = dsfit.reference(scene.integrand(hits, exact=True), scene.contexts(hits), 1e-6)
-    assert found.converged and len(hits) == 2
-    return found.value.mean(0)
+PIXEL, lit, pixel_truth = support.PIXEL, support.lit, support.pixel_truth
 
 
 def rendered(scene, kind="uniform", light=0.0, samples=64, passes=4, seed=1, where=PIXEL):
