@@ -42,7 +42,7 @@ int main() {
         const hair::Context context = hair::prepare(wo, known.n, known.v);
         std::array<Mean, hair::channels> albedo;
         Mean sphere;
-        for (int k = 0; k < 400000; k++) {
+        for (int k = 0; k < 200000; k++) {
             const hair::Sample s = hair::sample(context, {uniform(generator), uniform(generator), uniform(generator)});
             for (int c = 0; c < hair::channels; c++) albedo[c].add(s.f[c] / s.pdf);
             sphere.add(1 / s.pdf);

@@ -47,11 +47,14 @@ def check_namespace(name: str) -> str:
 def header_text(tables: Tables, namespace: str, comment: list[str], known: list[tuple[float, ...]]) -> str:
     """The whole header; `known` are rows theta_r, n, v, albedo by channel."""
     body = source("template.h")
+    numbers = "\n".join(_tables(tables))
+    content = hashlib.sha256((body + numbers).encode()).hexdigest()
     parts = {
+        "CONTENT": f"content_{content[:16]}",
         "GUARD": f"DSFIT_{check_namespace(namespace).upper()}_H",
         "NAMESPACE": namespace,
         "CHANNELS": str(len(tables.sigma_a)),
-        "TABLES": "\n".join(_tables(tables)),
+        "TABLES": numbers,
         "KNOWN": _known(known),
     }
     for name, text in parts.items():

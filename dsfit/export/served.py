@@ -18,8 +18,6 @@ def check_bsdf(bsdf: DualScattering) -> None:
     if not isinstance(bsdf, DualScattering):
         raise InputError("bsdf", type(bsdf).__name__, "a dsfit DualScattering")
     check_served(bsdf)
-    if bsdf.convention.transmittance != "power":
-        raise InputError("bsdf.convention.transmittance", bsdf.convention.transmittance, "'power'")
     if bsdf.terms != Terms():
         raise InputError("bsdf.terms", bsdf.terms, "all terms: a header computes the whole BSDF")
 

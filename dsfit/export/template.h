@@ -22,7 +22,9 @@
 #include <cmath>
 #include <cstdint>
 
+// Names differ between headers of different content, so that programs and plugins may hold several.
 namespace @NAMESPACE@ {
+inline namespace @CONTENT@ {
 
 inline constexpr int channels = @CHANNELS@;
 using Color = std::array<float, channels>;
@@ -666,6 +668,7 @@ struct Known {
 };
 @KNOWN@
 
+}  // namespace @CONTENT@
 }  // namespace @NAMESPACE@
 
 #endif  // @GUARD@

@@ -15,7 +15,7 @@ from tests.export import cases
 from tests.kernels import cases as kernels
 
 pytestmark = pytest.mark.skipif(not cases.has_compiler(), reason="no C++ compiler")
-SAMPLES = 200
+SAMPLES = 100
 SLOW = [
     pytest.param(preset, kind, flags, marks=pytest.mark.slow, id=f"{preset}-{kind}-{flags[-1]}")
     for preset in ("nonabsorbing", "blond", "brown", "black")

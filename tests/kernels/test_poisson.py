@@ -12,8 +12,6 @@ import torch
 import dsfit
 from dsfit.bsdf.conventions import Convention
 from dsfit.context import Context
-from dsfit.errors import InputError
-from dsfit.export.served import check_bsdf
 from dsfit.kernels import HairKernel
 from dsfit.proposals import AmortisedProposal
 from tests.kernels import cases
@@ -94,8 +92,3 @@ def test_a_whole_kernel_and_its_proposal() -> None:
     assert bool(((weight.mean(0) - exact).abs() < 5 * error + 2e-3 * exact).all())
     size = torch.linalg.vector_norm(weight, dim=-1)
     assert bool((size.std(0) < 0.15 * size.mean(0)).all())  # an untrained proposal that follows the law
-
-
-def test_headers_refuse_it() -> None:
-    with pytest.raises(InputError, match="transmittance: got 'poisson'; allowed: 'power'"):
-        check_bsdf(poisson_bsdf())
