@@ -102,6 +102,7 @@ def render(
     config: Config, identity: dict[str, Any], directory: RunDirectory, say: Callable[[str], None]
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Numbers and arrays of one tile."""
+    from dsfit.render.adaptive import render_adaptive
     from dsfit.render.integrator import render_tile
 
     clock = _Clock()
@@ -113,10 +114,12 @@ def render(
     prepared = clock.read()
     top, left, bottom, right = identity["tile"]
     say(f"row {top}, column {left}")
-    tile = render_tile(
-        scene, technique, range(top, bottom), range(left, right),
-        samples=asked.samples, passes=asked.passes, seed=direction_seed(config),
-    )  # fmt: skip
+    window = range(top, bottom), range(left, right)
+    effort = {"samples": asked.samples, "passes": asked.passes, "seed": direction_seed(config)}
+    if asked.pilot is None:
+        tile = render_tile(scene, technique, *window, **effort)
+    else:
+        tile = render_adaptive(scene, technique, *window, pilot=asked.pilot, **effort)
     data = {
         "tile": identity["tile"],
         "rays": tile.coverage.numel() * asked.subsamples,
@@ -141,7 +144,8 @@ def direction_seed(config: Config) -> int:
     """Seed of the random directions: other samples, passes or techniques get independent ones, at the same places of
     the rays, so that the noise of an image and of its reference has nothing in common."""
     asked = config.render
-    text = json.dumps([asked.seed, asked.samples, asked.passes, asked.technique.model_dump()], sort_keys=True)
+    effort = [asked.seed, asked.samples, asked.passes, asked.pilot]
+    text = json.dumps([*effort, asked.technique.model_dump()], sort_keys=True)
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "little")
 
 

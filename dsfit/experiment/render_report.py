@@ -23,7 +23,10 @@ def rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     workers = max(session.get("workers") or 1 for session in sessions)
     processes = f"{workers} process{'es' if workers > 1 else ''}"
     interrupted = f", in {len(sessions)} sittings" if len(sessions) > 1 else ""
-    directions = f"{render['passes']} passes of {render['samples']} directions per hit"
+    passes = f"{render['passes']} passes"
+    if render.get("pilot"):
+        passes = f"{render['pilot']} passes, then {render['passes']} more on average,"
+    directions = f"{passes} of {render['samples']} directions per hit"
     pixels = image["width"] * image["height"]
     share = f" with {100 * number(technique['light']):.3g} % light sampling" if number(technique["light"]) else ""
     found = [

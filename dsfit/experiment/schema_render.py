@@ -141,15 +141,17 @@ class RenderConfig(Section):
     """`[render]`.
 
     Every pixel has `subsamples` camera rays; the hits get `passes` times `samples` directions, in independent passes,
-    whose spread gives the variance. Tiles of `tile` x `tile` pixels are computed and stored one by one. `v` is the rule
-    for the directly lit share. `exposure` is a factor on the radiance (left out: one that suits the image) and, as
-    `tone_map`, matters to the PNG alone. `seed` places the rays; the seed of the directions follows from it, the
-    samples, the passes and the technique, so that images of one seed differ in their noise alone.
+    whose spread gives the variance. With `pilot`, so many passes come first, and the `passes` are an average, spread to
+    where the pilots of the neighbours were noisy. Tiles of `tile` x `tile` pixels are computed and stored one by one.
+    `v` is the rule for the directly lit share. `exposure` is a factor on the radiance (left out: one that suits the
+    image) and, as `tone_map`, matters to the PNG alone. `seed` places the rays; the seed of the directions follows from
+    it, the samples, the passes and the technique, so that images of one seed differ in their noise alone.
     """
 
     subsamples: Annotated[int, Field(ge=1, le=1024)] = 16
     samples: Samples = 16
     passes: Annotated[int, Field(ge=2, le=4096)] = 4
+    pilot: Annotated[int, Field(ge=2, le=4096)] | None = None
     tile: Annotated[int, Field(ge=1, le=4096)] = 64
     technique: Technique = Technique(light=0.25)
     v: Literal["poisson", "threshold"] = "poisson"

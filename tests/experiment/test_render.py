@@ -299,6 +299,15 @@ def test_images_of_other_sample_counts_differ_by_their_stated_variances(config: 
     assert errors.mse.value > 4 * errors.mse.standard_error  # about 0 if the reference had the image's directions
 
 
+def test_with_a_pilot_further_passes_go_where_it_was_noisy(config: Path) -> None:
+    experiment = load(config, ["render.pilot=2", "render.passes=6", "render.tile=14"])
+    outcome = runner.run(experiment, workers=0)
+    image = image_of(outcome.directory)
+    passes = image.samples[image.covered] / (image.coverage[image.covered] * 2 * 2)
+    assert set(passes.tolist()) <= {4.0, 6.0, 10.0, 18.0, 34.0} and len(set(passes.tolist())) > 1
+    assert "2 passes, then 6 more on average, of 2 directions" in dict(rows(outcome.result))["samples"]
+
+
 @pytest.mark.slow
 def test_the_shipped_quick_config_renders_compiled_and_smooth(tmp_path: Path) -> None:
     config = Path(__file__).parents[2] / "configs" / "render_quick.toml"
