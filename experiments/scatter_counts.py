@@ -1,6 +1,6 @@
 """Scatter counts from a grid of densities against exact counts of the geometry.
 
-    python experiments/scatter_counts.py --out DIR [--quick]     (measures: about six minutes)
+    python experiments/scatter_counts.py --out DIR [--quick]     (measures: about five minutes)
     python experiments/scatter_counts.py --plot DIR              (figure and table of what was measured)
 
 Rays start on fibres, at points spread evenly over their length or at points that a camera sees, and go in directions

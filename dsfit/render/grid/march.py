@@ -20,7 +20,7 @@ START = 0.25
 """Voxels that rays from points on fibres leave out at first. Densities are smeared over a voxel or two, and points on
 fibres, above all those that are seen, have less in front of them than that. Among 0, 1/4, 0.35 and 1/2, a quarter has
 the least mean square error of exp(-n) against whether the exact number of crossings is 0, in blocks, curtains and balls
-of hair, or comes within 2 % of it; exp(-n) of points seen is too small on average, mostly by less than half as much as
+of hair, or comes within 4 % of it; exp(-n) of points seen is too small on average, mostly by less than half as much as
 without (measured by experiments/scatter_counts.py)."""
 
 SELF = 0.276
