@@ -34,6 +34,7 @@ CASES = [
     ("amortised", {}, 0.25),
     ("best_mix", {"hits": 8, "samples": 8}, 0.0),
     ("guided", {}, 0.0),
+    ("guided", {"lights": 8, "steps": 1}, 0.25),
     ("guided", {"lights": 0, "rows": 4, "columns": 6}, 0.3),
 ]
 

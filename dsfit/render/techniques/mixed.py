@@ -135,5 +135,8 @@ def with_light(
     return MixSampler(problem, [*distributions, light(contexts)], _joined(shares, share), contexts, rule, model)
 
 
-def _joined(shares: Sequence[float], light: float) -> list[float]:
+def _joined(shares: Sequence[float] | Tensor, light: float) -> list[float] | Tensor:
+    """The shares with light's as the last."""
+    if isinstance(shares, Tensor):
+        return torch.cat([shares * (1 - light), torch.full_like(shares[:1], light)])
     return [c * (1 - light) for c in shares] + [light]
