@@ -178,6 +178,7 @@ class _Cell:
             images[name] = radiance.to(torch.float32).numpy()
         found = {
             "prepare": brush.preparation,
+            "light": brush.light,
             "rungs": rows,
             "slope": slope([r["samples"] for r in rows], [r["error"] for r in rows], floor),
             **pictures,

@@ -27,6 +27,9 @@ from dsfit.render.scene import RenderScene
 from dsfit.render.techniques import technique as make_technique
 
 _FEW = 16
+_SHARES = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85)
+"""Shares of light sampling that are tried where the best one is asked for."""
+_TRIAL, _TRIAL_SEED = 32, 2**40
 
 
 @dataclass(frozen=True)
@@ -134,14 +137,17 @@ class Painter:
 
     Attributes:
         preparation: seconds of what is done once: `prepare` (training that was recorded included), `first_use`
-            (compilers, tables), and their sum, `seconds`.
+            (compilers, tables), `trial` (of the share of light sampling), and their sum, `seconds`.
+        light: the share of light sampling.
         least: fewest samples per hit.
     """
 
     def __init__(self, picture: Picture, technique: Technique) -> None:
         self.picture, self.uniforms = picture, technique.uniforms
+        self.fitted = technique.light == "best"
+        self.light = _SHARES[0] if self.fitted else technique.light
         self.technique = make_technique(
-            technique.kind, technique.options, light=technique.light, uniforms=technique.uniforms, seed=1
+            technique.kind, technique.options, light=self.light, uniforms=technique.uniforms, seed=1
         )
         self.preparation: dict[str, float] = {}
         self.least = 1
@@ -158,7 +164,27 @@ class Painter:
             self.least = self.technique.at(part.hits, part.contexts, part.pixel).least
         twice = [timed(lambda: self._part(part, max(self.least, _FEW), 0))[1] for _ in range(2)]
         first = max(0.0, twice[0] - twice[1]) + children_seconds() - compilers
-        self.preparation = {"seconds": prepare + first, "prepare": prepare, "first_use": first}
+        trial = timed(self._fit_light)[1] if self.fitted else 0.0
+        self.preparation = {"seconds": prepare + first + trial, "prepare": prepare, "first_use": first, "trial": trial}
+
+    def _fit_light(self) -> None:
+        """Take the share of light sampling whose passes over a part of the picture differ least."""
+        part = self.picture.parts[len(self.picture.parts) // 2]
+        spread = {share: self._spread(share, part) for share in _SHARES}
+        self.light = min(_SHARES, key=lambda share: spread[share])
+        self.technique.peer.share = self.light  # type: ignore[attr-defined]
+
+    def _spread(self, share: float, part: Part) -> float:
+        """Mean relative variance of pixels between two passes."""
+        self.technique.peer.share = share  # type: ignore[attr-defined]
+        first, names = part.pixel[0], part.pixel - part.pixel[0]
+        passes = []
+        for seed in range(2):
+            value = self._part(part, max(self.least, _TRIAL), _TRIAL_SEED + seed)
+            total = torch.zeros(int(part.pixel[-1] - first) + 1, value.shape[-1], dtype=torch.float64)
+            passes.append(total.index_add_(0, names, value))
+        square = ((passes[0] + passes[1]) / 2).square()
+        return float(((passes[0] - passes[1]).square() / (square + 0.01 * square.mean())).mean())
 
     def _part(self, part: Part, samples: int, seed: int) -> Tensor:
         sampler = self.technique.at(part.hits, part.contexts, part.pixel)

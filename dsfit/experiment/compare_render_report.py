@@ -62,6 +62,8 @@ def _notes(row: dict[str, Any]) -> str:
     notes = ["FAILED: biased"] if row["biased"] else []
     if row["heavy"]:
         notes.append(f"heavy tails, {_percent(row['darker'])} too dark so far" if row["darker"] > 0 else "heavy tails")
+    if number(row["light"]) > 0:
+        notes.append(f"{100 * number(row['light']):.0f} % light")
     return "; ".join(notes)
 
 

@@ -215,7 +215,8 @@ def check_technique(raw: RawConfig, key: tuple[str | int, ...], technique: Techn
         known = "one of " + ", ".join(TECHNIQUES) + did_you_mean(technique.kind, TECHNIQUES)
         raise raw.error((*key, "kind"), known, technique.kind)
     try:
-        make(technique.kind, technique.options, light=technique.light, uniforms=technique.uniforms)
+        light = 0.5 if technique.light == "best" else technique.light  # type: ignore[comparison-overlap]
+        make(technique.kind, technique.options, light=light, uniforms=technique.uniforms)
     except InputError as error:
         name = error.field.rpartition(".")[2]
         where = ("options", name) if name in technique.options else ("light",) if name == "light" else ("options",)

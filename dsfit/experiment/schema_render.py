@@ -163,10 +163,12 @@ class RenderConfig(Section):
 
 
 class ComparedTechnique(Technique):
-    """`[[compare.techniques]]`: a technique with a name."""
+    """`[[compare.techniques]]`: a technique with a name. `light` may be "best": the share of least error in a short
+    trial on the picture, whose time counts as preparation."""
 
     name: Name
     kind: str
+    light: Share | Literal["best"] = 0.0
 
 
 class ReferenceConfig(Section):

@@ -22,7 +22,7 @@ from dsfit.experiment.compare_render_report import equal_error, markdown, qualit
 from dsfit.experiment.compare_render_summary import rows
 from dsfit.experiment.reader import ConfigError
 from dsfit.experiment.rundir import RunDirectory
-from dsfit.experiment.schema_render import Technique
+from dsfit.experiment.schema_render import ComparedTechnique, Technique
 from dsfit.experiment.validation import load
 from dsfit.render.images import RenderImage, read_image
 
@@ -198,7 +198,29 @@ def test_painting_is_reproducible_and_sees_the_background(config: Path) -> None:
     assert torch.equal(first, again) and not torch.equal(first, other)
     missed = picture.coverage == 0
     assert bool(missed.any()) and bool((first[missed] == 2.0).all())
-    assert set(painter.preparation) == {"seconds", "prepare", "first_use"}
+    assert set(painter.preparation) == {"seconds", "prepare", "first_use", "trial"}
+
+
+def test_the_share_of_light_sampling_is_the_best_of_a_trial(tmp_path: Path) -> None:
+    sun = """
+[light]
+kind = "sun"
+direction = [0.3, 0.1, 1.0]
+angular_radius_deg = 1.0
+radiance = 100.0
+"""
+    path = tmp_path / "sun.toml"
+    path.write_text(CONFIG + sun)
+    picture = picture_of(module.small(load(path, ['compare.techniques.1.light="best"']).config))
+    fitted = ComparedTechnique(name="x", kind="uniform", light="best", uniforms="random")
+    painter = picture.painter(fitted)
+    assert painter.light >= 0.7 and painter.preparation["trial"] > 0  # all light comes from one narrow cone
+    poor = picture.painter(Technique(kind="uniform", light=0.1, uniforms="random"))
+
+    def spread(one: Painter) -> float:
+        return float((one.paint(16, 1)[0] - one.paint(16, 2)[0]).square().mean())
+
+    assert spread(painter) < 0.5 * spread(poor)
 
 
 def _noisy(mean: Tensor, deviation: float, generator: torch.Generator) -> RenderImage:
