@@ -16,6 +16,8 @@ from dsfit.render.scene import RenderScene
 from dsfit.render.techniques import TECHNIQUES, technique
 from dsfit.render.techniques.mixed import MixSampler
 from dsfit.scene import ConstantLight
+from dsfit.scene.lights.sphere import SphereLight
+from dsfit.scene.lights.total import TotalLight
 from tests.render import support_render as support
 
 SMALL = {"proposals": ["M_TT", "R", "TRT", "MG_TT", "uniform"]}
@@ -125,6 +127,21 @@ def test_guided_lobes_follow_the_light_that_comes_through():
     apart = (found["guided"].radiance - found["amortised"].radiance).sum()
     error = sum(float(tile.variance.sum()) for tile in found.values()) ** 0.5 * 3**0.5
     assert abs(float(apart)) < 4 * error < 0.05 * float(found["guided"].radiance.sum())
+
+
+def test_nearby_lights_are_seen_from_every_hit():
+    near = SphereLight((1.5, 1.0, 1.5), 0.6, 4.0)
+    scene = support.scene(TotalLight([near, ConstantLight([0.1, 0.1, 0.1])]), all_rays=True, subsamples=4)
+    found = [
+        render_tile(scene, technique(kind, {}, light=light), range(4), range(6), samples=64, passes=8, seed=2)
+        for kind, light in (("guided", 0.0), ("uniform", 0.5), ("best_mix", 0.0))
+    ]
+    sums = [tile.radiance.sum((0, 1)) for tile in found]
+    errors = [tile.variance.sum((0, 1)).sqrt() for tile in found]
+    for one, error in zip(sums[1:], errors[1:], strict=True):
+        both = (errors[0].square() + error.square()).sqrt()
+        assert bool(((one - sums[0]).abs() < 4 * both).all()) and float((both / sums[0]).max()) < 0.02
+    assert float(found[0].variance.sum()) < 0.5 * float(found[1].variance.sum())
 
 
 def test_best_mix_is_better_than_equal_shares():
