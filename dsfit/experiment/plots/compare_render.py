@@ -15,7 +15,7 @@ from dsfit.experiment.files import number
 from dsfit.experiment.plots.style import COLORS, new_figure, short
 
 _MARKERS = ("o", "s", "^", "D", "v", "h", "<", ">")
-_HIGHEST = 3.0
+_HIGHEST = 10.0
 
 
 def compare_curves(result: dict[str, Any]) -> Figure:

@@ -18,7 +18,7 @@ from dsfit.experiment.race_report import seconds
 from dsfit.experiment.rundir import RunDirectory
 from dsfit.render.images import ToneMap, relative_squared_error
 
-_MOST_COLUMNS = 6
+_MOST_COLUMNS = 7
 _LOW, _HIGH = 0.01, 1.0
 _TITLES = {"equal_time": "as much as fits into {} of CPU time", "equal_samples": "{} directions per hit"}
 
