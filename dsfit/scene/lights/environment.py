@@ -12,6 +12,9 @@ rounding of solid angles is involved: sin latitude by the marginal, then longitu
 interpolated rows. It differs from the radiance only by the curvature of the sine inside a cell: luminance / density
 lies within 2/3 .. 2 of its mean in the two rows next to the poles and tends to it with the square of the texel size
 elsewhere. Both vanish at the same places.
+
+In float32, on the CPU and without gradients both are found by C++, if there is a compiler (`environment_native`), by
+the same law; elsewhere by the torch code here.
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ from dsfit.frame import to_angles
 from dsfit.proposals.base import Proposal
 from dsfit.scene.exr import read_exr
 from dsfit.scene.lights.base import Light, LightDistribution, around, tidy
+from dsfit.scene.lights.environment_native import Prepared
 
 _PI = math.pi
 MAX_LISTED = 64
@@ -90,6 +94,7 @@ class EnvironmentLight(Light):
         if not math.isfinite(self.scale * largest) or self.scale * largest > torch.finfo(image.dtype).max:
             raise InputError("scale", scale, f"numbers whose product with the largest pixel, {largest:g}, is finite")
         self.register_buffer("image", image)
+        self.prepared = Prepared()
         height = image.shape[0]
         # Node values of the density by row; the poles repeat the outermost rows. Tables stay float64: they are sums of
         # up to 1e7 terms.
@@ -159,6 +164,8 @@ class EnvironmentLight(Light):
 
     def forward(self, omega_i: Tensor) -> Tensor:
         check_directions(omega_i, field="omega_i")
+        if (compiled := self.prepared.serving(self, omega_i)) is not None:
+            return compiled.radiance(omega_i, self.rotation)
         k, t, j, s = self._coordinates(omega_i)
         weights = ((1 - t) * (1 - s), (1 - t) * s, t * (1 - s), t * s)
         corners = [place * self.channels for place in self._corners(k, j)]
@@ -243,6 +250,8 @@ class EnvironmentDistribution(LightDistribution):
     def sample(self, u: Tensor) -> Tensor:
         u = check_uniforms(u, self.dimension, self.batch_shape)
         light = self.light
+        if (compiled := light.prepared.serving(light, u)) is not None:
+            return compiled.sample(u, light.rotation)
         height, width = light.luminance.shape
         u0, u1 = u.to(torch.float64)[..., :2].unbind(-1)
         total = light.row_mass[-1]
@@ -282,6 +291,8 @@ class EnvironmentDistribution(LightDistribution):
     def log_prob(self, omega: Tensor) -> Tensor:
         check_directions(omega, self.batch_shape)
         light = self.light
+        if (compiled := light.prepared.serving(light, omega)) is not None:
+            return compiled.log_prob(omega, light.rotation)
         k, t, j, s = light._coordinates(omega)
         t, s = t.to(torch.float64), s.to(torch.float64)
         lower, upper = light.edges[k], light.edges[k + 1]
