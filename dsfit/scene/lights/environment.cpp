@@ -15,9 +15,9 @@ struct Map {
     const double *luminance, *column_mass, *row_values, *row_mass, *rises;  // as the light's tables
     const double *low, *high, *cosine;  // 1 - cos, 1 + cos and cos of the colatitudes of the nodes, [H + 2]
     const float* image;                 // [H][W + 1][stride], times scale; the last column repeats the first
-    const int32_t* row_guide;           // [H + 2]: last row interval whose mass does not exceed i / (H + 1) of the total
+    const int32_t* row_guide;           // [row_buckets + 1]: last row interval that starts within i / row_buckets
     const int32_t* column_guide;        // [H][buckets + 1]: the same for the columns of each row; -1: the row is black
-    int64_t height, width, channels, stride, buckets;
+    int64_t height, width, channels, stride, row_buckets, buckets;
 };
 
 typedef double D[N];
@@ -28,8 +28,10 @@ INLINE void sine_cosine(double x, double& sine, double& cosine) {
     double q = std::floor(x * (2 / PI) + 0.5), half = std::floor(q * 0.5), odd = q - 2 * half;
     double sign = 1 - 2 * (half - 2 * std::floor(half * 0.5));
     double r = (x - q * 1.5707963267948966) - q * 6.123233995736766e-17, z = r * r;
-    double s = r + r * z * (-1. / 6 + z * (1. / 120 + z * (-1. / 5040 + z * (1. / 362880 + z * (-1. / 39916800 + z * (1. / 6227020800))))));
-    double c = 1 + z * (-0.5 + z * (1. / 24 + z * (-1. / 720 + z * (1. / 40320 + z * (-1. / 3628800 + z * (1. / 479001600 - z * (1. / 87178291200)))))));
+    double s = -1. / 39916800 + z * (1. / 6227020800);
+    s = r + r * z * (-1. / 6 + z * (1. / 120 + z * (-1. / 5040 + z * (1. / 362880 + z * s))));
+    double c = -1. / 3628800 + z * (1. / 479001600 - z * (1. / 87178291200));
+    c = 1 + z * (-0.5 + z * (1. / 24 + z * (-1. / 720 + z * (1. / 40320 + z * c))));
     sine = sign * (odd * c + (1 - odd) * s);
     cosine = sign * ((1 - odd) * c - odd * s);
 }
@@ -59,11 +61,11 @@ INLINE double linear_inverse(double u, double a, double b) {
 }
 
 // Matrices, world to fibre, of the block's directions; frame i % frames belongs to direction i.
-INLINE void frames_of(const float* rotation, int64_t frames, int64_t first, int64_t count, D* matrix) {
+INLINE void frames_of(const float* rotation, int64_t frames, int64_t first, D* matrix) {
     int64_t at = first % frames;
     for (int l = 0; l < N; l++) {
         for (int e = 0; e < 9; e++) matrix[e][l] = rotation[9 * at + e];
-        if (l + 1 < count && ++at == frames) at = 0;
+        if (++at == frames) at = 0;
     }
 }
 
@@ -71,7 +73,7 @@ INLINE void frames_of(const float* rotation, int64_t frames, int64_t first, int6
 INLINE void place(const Map& m, const float* rotation, int64_t frames, const float* omega, int64_t first, int64_t count,
                   Place& p) {
     D matrix[9], theta, phi;
-    frames_of(rotation, frames, first, count, matrix);
+    frames_of(rotation, frames, first, matrix);
     EACH {
         int64_t i = first + (l < count ? l : 0);
         theta[l] = omega[2 * i];
@@ -89,7 +91,8 @@ INLINE void place(const Map& m, const float* rotation, int64_t frames, const flo
         double z = matrix[2][l] * st + matrix[5][l] * v + matrix[8][l] * w;
         double flat = x * x + z * z;
         p.cosine[l] = y / std::sqrt(flat + y * y);
-        double row = angle(std::sqrt(flat), y) * (height / PI) - 0.5, column = (PI - angle(x, z)) * (width / (2 * PI)) - 0.5;
+        double row = angle(std::sqrt(flat), y) * (height / PI) - 0.5;
+        double column = (PI - angle(x, z)) * (width / (2 * PI)) - 0.5;
         double k = std::floor(row), j = std::floor(column);
         double t = row - k, s = column - j;
         k = k + 1;
@@ -151,7 +154,8 @@ extern "C" void dsfit_environment_log_prob(const Map* map, const float* rotation
         for (int l = 0; l < left; l++) {
             const int64_t k = p.k[l], j = p.j[l], after = j + 1 == m.width ? 0 : j + 1;
             const double *top = m.luminance + above(k) * m.width, *bottom = m.luminance + below(m, k) * m.width;
-            const double s = p.s[l], one = (1 - s) * top[j] + s * top[after], two = (1 - s) * bottom[j] + s * bottom[after];
+            const double s = p.s[l];
+            const double one = (1 - s) * top[j] + s * top[after], two = (1 - s) * bottom[j] + s * bottom[after];
             // Place in the row measured in sin(latitude). Rounding takes neither weight to zero: the radiance has both.
             double near = (m.cosine[k] - p.cosine[l]) / m.rises[k];
             near = near < 1e-12 ? 1e-12 : near > 1 - 1e-12 ? 1 - 1e-12 : near;
@@ -168,7 +172,7 @@ INLINE int64_t column_bucket(const Map& m, double u) {
 struct Row { int64_t k; double target; };
 
 INLINE Row find_row(const Map& m, double u) {
-    const int64_t buckets = m.height + 1;
+    const int64_t buckets = m.row_buckets;
     const double total = m.row_mass[m.height + 1];
     double target = u * total;  // strictly below the total: a trailing row without mass is never chosen
     if (!(target < total)) target = std::nextafter(total, 0.0);
@@ -180,23 +184,32 @@ INLINE Row find_row(const Map& m, double u) {
 }
 
 struct Column { int64_t j; double start, goal; };
+struct Bounds { int64_t low, high; };
 
-// The last column whose mass, interpolated between two rows, does not exceed u of the whole. It lies between those of
-// the two rows alone, which the guides bound.
-INLINE Column find_column(const Map& m, int64_t k, double t, double u) {
-    const int64_t up = above(k), down = below(m, k), width = m.width;
-    const double *one = m.column_mass + up * (width + 1), *two = m.column_mass + down * (width + 1), rest = 1 - t;
+INLINE const int32_t* guide_at(const Map& m, int64_t row, double u) {
+    return m.column_guide + row * (m.buckets + 1) + column_bucket(m, u);
+}
+
+// Columns between which that of the quantile u lies, in a row interpolated between k and k + 1: it lies between those
+// of the two rows alone, which the guides bound.
+INLINE Bounds column_bounds(const Map& m, int64_t k, double u) {
+    const int32_t *first = guide_at(m, above(k), u), *second = guide_at(m, below(m, k), u);
+    int32_t a = first[0], b = second[0], c = first[1], d = second[1];
+    if (a < 0) a = b, c = d;
+    if (b < 0) b = a, d = c;
+    return {a < b ? a : b, (c > d ? c : d) + 1};
+}
+
+// The last column whose mass, interpolated between the two rows, does not exceed u of the whole.
+INLINE Column find_column(const Map& m, int64_t k, double t, double u, Bounds bounds) {
+    const int64_t width = m.width;
+    const double *one = m.column_mass + above(k) * (width + 1), *two = m.column_mass + below(m, k) * (width + 1);
+    const double rest = 1 - t;
     auto mass = [&](int64_t j) { return rest * one[j] + t * two[j]; };
     const double full = mass(width);
     double goal = u * full;
     if (!(goal < full)) goal = std::nextafter(full, 0.0);
-    const int64_t bucket = column_bucket(m, u);
-    const int32_t *first = m.column_guide + up * (m.buckets + 1) + bucket;
-    const int32_t *second = m.column_guide + down * (m.buckets + 1) + bucket;
-    if (first[0] < 0) first = second;
-    if (second[0] < 0) second = first;
-    int64_t low = first[0] < second[0] ? first[0] : second[0], high = (first[1] > second[1] ? first[1] : second[1]) + 1;
-    if (low < 0) low = 0;
+    int64_t low = bounds.low > 0 ? bounds.low : 0, high = bounds.high;
     double start = mass(low);
     if (start > goal) { low = 0; start = mass(0); }  // rounding at the border of a bucket
     if (mass(high) <= goal) high = width;
@@ -217,11 +230,16 @@ extern "C" void dsfit_environment_sample(const Map* map, const float* rotation, 
     const Map m = *map;
     D matrix[9], fraction, a, b, rise, low, high, t, sine, cosine, column, theta, phi;
     int64_t k[N];
+    Bounds bounds[N];
     for (int64_t first = 0; first < count; first += N) {
         const int64_t left = count - first < N ? count - first : N;
-        frames_of(rotation, frames, first, left, matrix);
+        frames_of(rotation, frames, first, matrix);
         EACH {
-            const Row r = find_row(m, u[step * (first + (l < left ? l : 0))]);
+            const float* given = u + step * (first + (l < left ? l : 0));
+            const Row r = find_row(m, given[0]);
+            // What the loops below read is asked for one loop ahead.
+            __builtin_prefetch(guide_at(m, above(r.k), given[1]));
+            __builtin_prefetch(guide_at(m, below(m, r.k), given[1]));
             k[l] = r.k;
             fraction[l] = (r.target - m.row_mass[r.k]) / (m.row_mass[r.k + 1] - m.row_mass[r.k]);
             a[l] = m.row_values[r.k];
@@ -235,10 +253,18 @@ extern "C" void dsfit_environment_sample(const Map* map, const float* rotation, 
             // 1 - cos and 1 + cos of the colatitude, each without cancellation at its own pole
             double from = low[l] + t[l] * rise[l], to = high[l] + (1 - t[l]) * rise[l];
             sine[l] = std::sqrt(from * to);
-            cosine[l] = from < to ? 1 - from : to - 1;
+            cosine[l] = 1 - from;
         }
         EACH {
-            const Column c = find_column(m, k[l], t[l], u[step * (first + (l < left ? l : 0)) + 1]);
+            bounds[l] = column_bounds(m, k[l], u[step * (first + (l < left ? l : 0)) + 1]);
+            const int64_t middle = (bounds[l].low + bounds[l].high) / 2, up = above(k[l]), down = below(m, k[l]);
+            __builtin_prefetch(m.column_mass + up * (m.width + 1) + middle);
+            __builtin_prefetch(m.column_mass + down * (m.width + 1) + middle);
+            __builtin_prefetch(m.luminance + up * m.width + middle);
+            __builtin_prefetch(m.luminance + down * m.width + middle);
+        }
+        EACH {
+            const Column c = find_column(m, k[l], t[l], u[step * (first + (l < left ? l : 0)) + 1], bounds[l]);
             const double *one = m.luminance + above(k[l]) * m.width, *two = m.luminance + below(m, k[l]) * m.width;
             const int64_t after = c.j + 1 == m.width ? 0 : c.j + 1;
             a[l] = (1 - t[l]) * one[c.j] + t[l] * two[c.j];
@@ -267,7 +293,8 @@ extern "C" void dsfit_environment_sample(const Map* map, const float* rotation, 
 }
 
 // Last of `count` intervals whose start, in the cumulative sums [count + 1], does not exceed i / buckets of the whole.
-extern "C" void dsfit_environment_guide(const double* sums, int64_t rows, int64_t count, int64_t buckets, int32_t* guide) {
+extern "C" void dsfit_environment_guide(const double* sums, int64_t rows, int64_t count, int64_t buckets,
+                                        int32_t* guide) {
     for (int64_t row = 0; row < rows; row++, sums += count + 1, guide += buckets + 1) {
         int64_t j = 0;
         for (int64_t i = 0; i <= buckets; i++) {

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _SOURCE = Path(__file__).with_name("environment.cpp")
 _TABLES = ("luminance", "column_mass", "row_values", "row_mass", "rises")
 _MADE = ("low", "high", "cosine", "image", "row_guide", "column_guide")
-_SIZES = ("height", "width", "channels", "stride", "buckets")
+_SIZES = ("height", "width", "channels", "stride", "row_buckets", "buckets")
 
 
 class _Map(ctypes.Structure):
@@ -56,20 +56,20 @@ class CompiledMap:
         image[:, :width, :channels] = light.image.detach() * light.scale
         image[:, width] = image[:, 0]
         half = light.edges / 2
-        buckets = -(-width // 4)
+        row_buckets, buckets = 8 * (height + 1), -(-width // 2)
         made = {
             "low": 2 * torch.sin(half) ** 2,
             "high": 2 * torch.cos(half) ** 2,
             "cosine": torch.cos(light.edges),
             "image": image,
-            "row_guide": torch.empty(1, height + 2, dtype=torch.int32),
+            "row_guide": torch.empty(1, row_buckets + 1, dtype=torch.int32),
             "column_guide": torch.empty(height, buckets + 1, dtype=torch.int32),
         }
         # kept, for as long as C++ holds their addresses
         self.tensors = {name: getattr(light, name).contiguous() for name in _TABLES} | made
-        self._guide("row_mass", "row_guide", 1, height + 1, height + 1)
+        self._guide("row_mass", "row_guide", 1, height + 1, row_buckets)
         self._guide("column_mass", "column_guide", height, width, buckets)
-        sizes = dict(zip(_SIZES, (height, width, channels, stride, buckets), strict=True))
+        sizes = dict(zip(_SIZES, (height, width, channels, stride, row_buckets, buckets), strict=True))
         self.channels = channels
         self.map = _Map(**{name: x.data_ptr() for name, x in self.tensors.items()}, **sizes)
 
