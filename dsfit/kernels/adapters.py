@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import TYPE_CHECKING
 
 import torch
@@ -48,6 +49,13 @@ class KernelDistribution(Distribution):
     def __init__(self, kernel: HairKernel, context: Context) -> None:
         self.kernel, self.context, self.batch_shape = kernel, context, context.batch_shape
         self.contexts: Contexts = kernel.prepare_context(context.reshape(-1))
+
+    def taken(self, index: Tensor) -> KernelDistribution:
+        """The mixtures of some of the contexts, as they are now."""
+        other = copy.copy(self)
+        other.context, other.contexts = self.context.reshape(-1)[index], self.contexts[index]
+        other.batch_shape = other.context.batch_shape
+        return other
 
     def sample_with_log_prob(self, u: Tensor) -> tuple[Tensor, Tensor]:
         omega = self.sample(u)

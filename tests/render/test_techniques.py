@@ -15,6 +15,7 @@ from dsfit.render.integrator import Accumulated, render_tile
 from dsfit.render.scene import RenderScene
 from dsfit.render.techniques import TECHNIQUES, technique
 from dsfit.render.techniques.mixed import MixSampler
+from dsfit.render.techniques.split import ChosenSampler, SplitSampler
 from dsfit.scene import ConstantLight
 from dsfit.scene.lights.sphere import SphereLight
 from dsfit.scene.lights.total import TotalLight
@@ -107,6 +108,38 @@ def test_shares_of_one_hit_differ_from_another_s():
     error = runs.std(0) / 60**0.5
     assert bool(((runs.mean(0) - exact).abs() < 4 * error + 5e-4 * exact).all())
     assert float((error / exact).max()) < 0.02
+
+
+@pytest.mark.parametrize(("samples", "runs"), [(2, 700), (6, 200), (8, 150)])
+def test_split_numbers_of_samples_are_unbiased(samples, runs):
+    """Whole numbers and rounded ones, from hits with both strategies and with light alone."""
+    scene = support.scene(support.lit("lobe"), all_rays=True)
+    made = technique("guided").prepare(scene)
+    hits = scene.hits(*support.PIXEL)
+    contexts = scene.contexts(hits)
+    chosen = made.at(hits, contexts)
+    choice = torch.arange(len(hits)) % 2
+    light = made.peer.light
+    sampler = SplitSampler(made.problem, chosen.many.lobes, light, [0.25, 1.0], choice, contexts)
+    exact = dsfit.reference(scene.integrand(hits, exact=True), contexts, 1e-5).value
+    with torch.no_grad():
+        found = torch.stack([sampler.estimate(samples, torch.Generator().manual_seed(k)) for k in range(runs)])
+    error = found.std(0) / runs**0.5
+    assert bool(((found.mean(0) - exact).abs() < 4 * error + 5e-4 * exact).all())
+    assert float((error / exact).max()) < 0.08
+
+
+def test_fits_are_made_when_there_are_samples_enough():
+    scene = support.scene(support.lit("lobe"), all_rays=True)
+    made = technique("guided").prepare(scene)
+    hits = scene.hits(*support.PIXEL)
+    contexts = scene.contexts(hits)
+    sampler = made.at(hits, contexts)
+    alone = ChosenSampler(sampler.few, lambda: pytest.fail("fitted for nothing"), float("inf"))
+    split = ChosenSampler(sampler.few, lambda: sampler.many, 4)
+    for samples, same in ((3, sampler.few), (4, sampler.many)):
+        one, two, three = (x.estimate(samples, torch.Generator().manual_seed(1)) for x in (split, same, alone))
+        assert torch.equal(one, two) and torch.equal(one, three) == (samples == 3)
 
 
 def test_guided_lobes_follow_the_light_that_comes_through():

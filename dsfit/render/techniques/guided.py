@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -21,17 +22,29 @@ from dsfit.race.peer import Problem, Sampler
 from dsfit.render.integrand import HairIntegrand
 from dsfit.render.techniques.amortised import Amortised
 from dsfit.render.techniques.guide_nodes import Nodes
-from dsfit.render.techniques.mixed import LightAt, MixSampler
+from dsfit.render.techniques.mixed import LightAt
+from dsfit.render.techniques.split import ChosenSampler, SplitSampler
 from dsfit.scene.lights import ConstantLight
 
 if TYPE_CHECKING:
     from dsfit.kernels import HairKernel
 
-_AT_ONCE = 512  # hits whose densities at all guide directions stay in cache
+_AT_ONCE = 1024  # hits whose densities at all guide directions stay in cache
 _KEPT = 0.1
 """Part of its first weight that a component keeps whatever the nodes say: they may miss a narrow lobe."""
 _LIGHT, _LEAST = 0.25, 0.02
 """First share of light sampling, and the least of it and of the lobes."""
+_SHARES = {0.25: 1.2, 0.5: 1.2, 1.0: 0.8}
+"""Shares of light sampling that hits choose from, and the cost of a direction with them."""
+_TRIAL, _EACH, _PASSES = 384, 32, 8
+"""Hits, directions and passes of the trial that compares with light sampling alone."""
+_DEARER = 1.2
+"""Cost of a direction in units of light sampling alone."""
+_FIT = {True: 22.0, False: 44.0}
+"""Cost of the fit of a hit in the same units, with light at infinity and with nearby lights."""
+_DIM = 0.1
+"""In the trial hits count by their relative variance; those darker than this part of the root mean square, as if they
+were that bright."""
 _SCALE, _EDGE = FIELDS.index("log_scale"), FIELDS.index("edge")
 
 
@@ -44,8 +57,12 @@ class Guided(Amortised):
     weighted by the inverse of their density. There f = |F| cos(theta_i) L is evaluated by the kernel, with n from a
     table of the grid (trilinear in the hit's position). Steps `w_k <- w_k sqrt(sum_q f_q^2 p_k(q) / P(q)^2)`,
     normalised, P = sum_k w_k p_k + the uniform share, lower the second moment of the mixture over these nodes, which is
-    convex in w (Torsney 1983; He and Owen 2014). The nodes only choose weights: estimates are unbiased whatever they
-    say.
+    convex in w (Torsney 1983; He and Owen 2014). Then a hit takes the share of light sampling, of a few, with the least
+    product of second moment and cost: light alone at many hits under narrow lights. The nodes only choose weights:
+    estimates are unbiased whatever they say.
+
+    A fit costs as much as some tens of directions. A trial on the scene's sample of hits says from how many samples on
+    it pays (`worthwhile`, infinite where light alone is about as good); fewer are drawn from the light alone.
 
     Args:
         proposal, file, file_seconds, train, training: see `Amortised`.
@@ -67,9 +84,9 @@ class Guided(Amortised):
         file_seconds: float = 0.0,
         train: bool = False,
         training: dict[str, Any] | None = None,
-        rows: int = 6,
-        columns: int = 12,
-        lights: int = 16,
+        rows: int = 5,
+        columns: int = 8,
+        lights: int = 8,
         steps: int = 3,
     ) -> None:
         super().__init__(proposal, file, file_seconds, train, training)
@@ -87,24 +104,49 @@ class Guided(Amortised):
         integrand: HairIntegrand = problem.integrand  # type: ignore[assignment]
         lights = 0 if isinstance(integrand.light, ConstantLight) else self.lights
         self.nodes = Nodes(integrand, self.rows, self.columns, lights, problem.seed)
-        self.light = LightAt(integrand) if lights else None
+        self.light, self.worthwhile = LightAt(integrand) if lights else None, 0.0
+        if self.light is not None:
+            with torch.no_grad():
+                self.worthwhile = self._worthwhile(self.light)
+
+    def _worthwhile(self, light: LightAt) -> float:
+        """The samples from which on the fit pays: fewer are better drawn from the light alone, which costs less. By the
+        mean relative variances of both at hits of the scene's sample."""
+        generator = torch.Generator().manual_seed(self.problem.seed)
+        contexts = self.problem.stream.draw(_TRIAL, generator, dtype=self.problem.dtype)
+        found = []
+        for sampler in (self._split(contexts), DensitySampler(self.problem, light(contexts), contexts)):
+            found.append(torch.stack([sampler.estimate(_EACH, generator) for _ in range(_PASSES)]))
+        size = (sum(x.mean(0) for x in found) / 2).square().mean(-1)
+        size = size + _DIM * _DIM * size.mean()
+        split, alone = (float((x.var(0).mean(-1) / size).mean()) for x in found)
+        gain = alone / max(split, 1e-30) - _DEARER
+        return _FIT[self.nodes.far] / gain if gain > 0 else float("inf")
 
     def at(self, contexts: Context) -> Sampler:
-        """Weights of every hit."""
+        """Weights of every hit; where there is a light to sample, found when they are needed."""
+        if self.light is None:
+            return DensitySampler(self.problem, self._mixture_at(contexts)[0], contexts)
+        alone = DensitySampler(self.problem, self.light(contexts), contexts)
+        return ChosenSampler(alone, functools.partial(self._split, contexts), self.worthwhile)
+
+    def _split(self, contexts: Context) -> SplitSampler:
+        """Lobes and light with the shares that fit every hit."""
+        lobes, choice = self._mixture_at(contexts)
+        return SplitSampler(self.problem, lobes, self.light, list(_SHARES), choice, contexts)  # type: ignore[arg-type]
+
+    def _mixture_at(self, contexts: Context) -> tuple[KernelDistribution, Tensor]:
+        """The mixtures with fitted weights, and the hits' choices of shares of light sampling `[H]`."""
         distribution = KernelDistribution(self.kernel, contexts)
         flat = contexts.reshape(-1)
         starts = range(0, len(flat), _AT_ONCE)
         fits = [self._fitted(distribution.contexts[s : s + _AT_ONCE], flat[s : s + _AT_ONCE]) for s in starts]
         ready, fields = distribution.contexts, torch.cat([fit[0] for fit in fits], dim=-1)
         distribution.contexts = Contexts(ready.theta_r, ready.n, ready.v, fields, ready.sphere, ready.need)
-        if self.light is None:
-            return DensitySampler(self.problem, distribution, contexts)
-        share = torch.cat([fit[1] for fit in fits])
-        pair = [distribution, self.light(contexts)]
-        return MixSampler(self.problem, pair, torch.stack([1 - share, share]), contexts, "balance", "one")
+        return distribution, torch.cat([fit[1] for fit in fits])
 
     def _fitted(self, ready: Contexts, contexts: Context) -> tuple[Tensor, Tensor]:
-        """The mixture's fields with the weights fitted to f^2 at the nodes, and the share `[H]` of light sampling."""
+        """The mixture's fields with the weights fitted to f^2 at the nodes, and which of `_SHARES` hits take."""
         omega, weight, n, v, radiance, light = self.nodes.at(contexts)
         theta_i, phi = omega[..., 0].contiguous(), (contexts.phi_r - omega[..., 1]).contiguous()
         flat = (x.expand(theta_i.shape).reshape(-1) for x in (contexts.theta_r, n, v, theta_i, phi))
@@ -147,7 +189,8 @@ def _densities(kernel: HairKernel, ready: Contexts, theta_i: Tensor, phi: Tensor
 def _weights(
     densities: list[Tensor], start: Tensor, sphere: float, light: Tensor | None, squared: Tensor, steps: int
 ) -> tuple[Tensor, Tensor]:
-    """Factors `[K, H]` on the components' weights `start`, and the share `[H]` of light sampling (density `light`).
+    """Factors `[K, H]` on the components' weights `start`, and which of `_SHARES` light sampling (density `light`) has,
+    `[H]`.
 
     The mixture of lobes keeps its sum of weights and its uniform share.
     """
@@ -170,4 +213,16 @@ def _weights(
             own, other = share * torch.sqrt(lit), (1 - share) * torch.sqrt(unlit)
             share = (own / (own + other).clamp_min(1e-30)).clamp(_LEAST, 1 - _LEAST)
         ratio = torch.where(start > 0, weight / start.clamp_min(1e-30), 0.0)
-    return ratio, share
+    return ratio, share if light is None else _share(densities, ratio, sphere, light, squared)
+
+
+def _share(densities: list[Tensor], ratio: Tensor, sphere: float, light: Tensor, squared: Tensor) -> Tensor:
+    """Which of `_SHARES` `[H]` has the least product of second moment and cost."""
+    lobes = torch.full_like(squared, sphere)
+    for density, own in zip(densities, ratio, strict=True):
+        lobes.addcmul_(density, own)
+    found = []
+    for c, cost in _SHARES.items():
+        mix = lobes * (1 - c) + light * c
+        found.append(cost * torch.where(squared > 0, squared / mix, 0.0).sum(0))
+    return torch.stack(found).argmin(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -28,6 +29,11 @@ class LightAt(Proposal):
     def __init__(self, integrand: HairIntegrand) -> None:
         super().__init__()
         self.integrand = [integrand]  # not a submodule
+
+    @functools.cached_property
+    def dimension(self) -> int:
+        """Uniform numbers per direction."""
+        return self.integrand[0].light.proposal()(Context(0.0)).dimension
 
     def forward(self, context: Context) -> Distribution:
         return self.integrand[0].light_at(context).proposal()(context)
@@ -113,10 +119,17 @@ def with_light(
     Raises:
         InputError: a sampler that does not tell what it draws from.
     """
+    from dsfit.render.techniques.split import ChosenSampler, SplitSampler
+
+    if isinstance(sampler, ChosenSampler):
+        sampler = sampler.many
     if isinstance(sampler, EachSampler):
         each = [contexts[k : k + 1] for k in range(len(contexts))]
         pairs = zip(sampler.samplers, each, strict=True)
         return EachSampler([with_light(one, problem, light, share, c, rule, model) for one, c in pairs])
+    if isinstance(sampler, SplitSampler):
+        parts = [sampler.lobes, sampler.light(contexts), light(contexts)]
+        return MixSampler(problem, parts, _joined(sampler.shares, share), contexts, "balance", "one")
     if isinstance(sampler, OptimalSampler):
         proposals, fractions = [*sampler.proposals, light], _joined(sampler.options["allocation"], share)
         return OptimalSampler(
