@@ -7,6 +7,7 @@ import torch
 
 import dsfit
 from dsfit.errors import InputError
+from dsfit.race.density import DensitySampler
 from dsfit.render.adaptive import allocate, render_adaptive
 from dsfit.render.camera import Camera
 from dsfit.render.geometry import block
@@ -140,6 +141,21 @@ def test_fits_are_made_when_there_are_samples_enough():
     for samples, same in ((3, sampler.few), (4, sampler.many)):
         one, two, three = (x.estimate(samples, torch.Generator().manual_seed(1)) for x in (split, same, alone))
         assert torch.equal(one, two) and torch.equal(one, three) == (samples == 3)
+
+
+@pytest.mark.parametrize(("light", "kind"), [("lobe", MixSampler), ("sun", DensitySampler)])
+def test_few_samples_are_drawn_from_what_does_best(light, kind):
+    """Light alone under a sun, where the lobes find next to nothing; both under a light as wide as they are."""
+    scene = support.scene(support.lit(light), all_rays=True)
+    made = technique("guided").prepare(scene)
+    hits = scene.hits(*support.PIXEL)
+    few = made.at(hits, scene.contexts(hits)).few
+    assert type(few) is kind and (made.peer.plain == 1) == (kind is DensitySampler)
+    with torch.no_grad():
+        found = torch.stack([few.estimate(16, torch.Generator().manual_seed(k)).mean(0) for k in range(200)])
+    error, exact = found.std(0) / 200**0.5, support.pixel_truth(light)
+    assert bool(((found.mean(0) - exact).abs() < 4 * error + 5e-4 * exact).all())
+    assert float((error / exact).max()) < 0.02
 
 
 def test_guided_lobes_follow_the_light_that_comes_through():

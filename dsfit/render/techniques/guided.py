@@ -22,7 +22,7 @@ from dsfit.race.peer import Problem, Sampler
 from dsfit.render.integrand import HairIntegrand
 from dsfit.render.techniques.amortised import Amortised
 from dsfit.render.techniques.guide_nodes import Nodes
-from dsfit.render.techniques.mixed import LightAt
+from dsfit.render.techniques.mixed import LightAt, MixSampler
 from dsfit.render.techniques.split import ChosenSampler, SplitSampler
 from dsfit.scene.lights import ConstantLight
 
@@ -39,7 +39,9 @@ _SHARES = {0.25: 1.2, 0.5: 1.2, 1.0: 0.8}
 _TRIAL, _EACH, _PASSES = 384, 32, 8
 """Hits, directions and passes of the trial that compares with light sampling alone."""
 _DEARER = 1.2
-"""Cost of a direction in units of light sampling alone."""
+"""Cost of a direction with fitted weights in units of light sampling alone."""
+_PLAIN = {1.0: 1.0, 0.85: 1.2, 0.5: 1.3}
+"""Shares of light sampling that the trial chooses from for few samples, and the cost of a direction with them."""
 _FIT = {True: 22.0, False: 44.0}
 """Cost of the fit of a hit in the same units, with light at infinity and with nearby lights."""
 _DIM = 0.1
@@ -62,7 +64,8 @@ class Guided(Amortised):
     estimates are unbiased whatever they say.
 
     A fit costs as much as some tens of directions. A trial on the scene's sample of hits says from how many samples on
-    it pays (`worthwhile`, infinite where light alone is about as good); fewer are drawn from the light alone.
+    it pays (`worthwhile`, infinite where nothing is gained); fewer are drawn from the light alone, or from the light
+    and the mixture as it is, with one share for all hits: whatever does best in the trial (`plain`).
 
     Args:
         proposal, file, file_seconds, train, training: see `Amortised`.
@@ -104,31 +107,41 @@ class Guided(Amortised):
         integrand: HairIntegrand = problem.integrand  # type: ignore[assignment]
         lights = 0 if isinstance(integrand.light, ConstantLight) else self.lights
         self.nodes = Nodes(integrand, self.rows, self.columns, lights, problem.seed)
-        self.light, self.worthwhile = LightAt(integrand) if lights else None, 0.0
+        self.light, self.plain, self.worthwhile = LightAt(integrand) if lights else None, 1.0, 0.0
         if self.light is not None:
             with torch.no_grad():
-                self.worthwhile = self._worthwhile(self.light)
+                self._try()
 
-    def _worthwhile(self, light: LightAt) -> float:
-        """The samples from which on the fit pays: fewer are better drawn from the light alone, which costs less. By the
-        mean relative variances of both at hits of the scene's sample."""
+    def _try(self) -> None:
+        """Find the share for few samples, and the samples from which on the fit pays: by the mean relative variances at
+        hits of the scene's sample."""
         generator = torch.Generator().manual_seed(self.problem.seed)
         contexts = self.problem.stream.draw(_TRIAL, generator, dtype=self.problem.dtype)
-        found = []
-        for sampler in (self._split(contexts), DensitySampler(self.problem, light(contexts), contexts)):
-            found.append(torch.stack([sampler.estimate(_EACH, generator) for _ in range(_PASSES)]))
-        size = (sum(x.mean(0) for x in found) / 2).square().mean(-1)
+        samplers = [self._split(contexts), *(self._unfitted(contexts, share) for share in _PLAIN)]
+        found = [torch.stack([x.estimate(_EACH, generator) for _ in range(_PASSES)]) for x in samplers]
+        size = (sum(x.mean(0) for x in found) / len(found)).square().mean(-1)
         size = size + _DIM * _DIM * size.mean()
-        split, alone = (float((x.var(0).mean(-1) / size).mean()) for x in found)
-        gain = alone / max(split, 1e-30) - _DEARER
-        return _FIT[self.nodes.far] / gain if gain > 0 else float("inf")
+        split, *plain = (float((x.var(0).mean(-1) / size).mean()) for x in found)
+        products = {share: cost * x for (share, cost), x in zip(_PLAIN.items(), plain, strict=True)}
+        self.plain = min(products, key=products.__getitem__)
+        gain = products[self.plain] / max(split, 1e-30) - _DEARER
+        self.worthwhile = _FIT[self.nodes.far] / gain if gain > 0 else float("inf")
 
     def at(self, contexts: Context) -> Sampler:
         """Weights of every hit; where there is a light to sample, found when they are needed."""
         if self.light is None:
             return DensitySampler(self.problem, self._mixture_at(contexts)[0], contexts)
-        alone = DensitySampler(self.problem, self.light(contexts), contexts)
-        return ChosenSampler(alone, functools.partial(self._split, contexts), self.worthwhile)
+        few = self._unfitted(contexts, self.plain)
+        return ChosenSampler(few, functools.partial(self._split, contexts), self.worthwhile)
+
+    def _unfitted(self, contexts: Context, share: float) -> Sampler:
+        """The light with this share, beside the mixture as its hints make it."""
+        assert self.light is not None
+        light = self.light(contexts)
+        if share == 1:
+            return DensitySampler(self.problem, light, contexts)
+        pair = [KernelDistribution(self.kernel, contexts), light]
+        return MixSampler(self.problem, pair, [1 - share, share], contexts)
 
     def _split(self, contexts: Context) -> SplitSampler:
         """Lobes and light with the shares that fit every hit."""
