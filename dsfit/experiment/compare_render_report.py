@@ -6,12 +6,12 @@ import math
 from typing import Any
 
 from rich.console import Group, RenderableType
-from rich.table import Table
 
 from dsfit.experiment.compare_render_curve import Time
 from dsfit.experiment.compare_render_summary import reference_of, rows
 from dsfit.experiment.files import number
 from dsfit.experiment.race_report import seconds
+from dsfit.experiment.report_tables import markdown_table, rich_table
 
 _MARKS = {"measured": "", "extrapolated": "~", "at most": "<", "more": ">"}
 
@@ -138,23 +138,10 @@ def _parts(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
 
 def terminal_table(result: dict[str, Any]) -> RenderableType:
     """Both tables as rich ones, and the caption."""
-    return Group(*(_rich(*part) for part in _parts(result)), caption(result))
-
-
-def _rich(title: str, lines: list[list[str]]) -> Table:
-    made = Table(title=title, title_justify="left", title_style="bold")
-    for k, head in enumerate(lines[0]):
-        made.add_column(head, justify="left" if k == 0 or not head else "right", overflow="fold")
-    for line in lines[1:]:
-        made.add_row(*line)
-    return made
+    return Group(*(rich_table(*part) for part in _parts(result)), caption(result))
 
 
 def markdown(result: dict[str, Any]) -> str:
     """The same as Markdown."""
-    texts = []
-    for title, lines in _parts(result):
-        rule = ["---", *["---:"] * (len(lines[0]) - 1)]
-        body = "\n".join("| " + " | ".join(x) + " |" for x in [lines[0], rule, *lines[1:]])
-        texts.append(f"# {title}\n\n{body}\n")
+    texts = [markdown_table(*part) for part in _parts(result)]
     return "\n".join([*texts, caption(result), ""])

@@ -6,10 +6,10 @@ import math
 from typing import Any
 
 from rich.console import Group, RenderableType
-from rich.table import Table
 
 from dsfit.experiment.files import number
 from dsfit.experiment.race_summary import rows, winners
+from dsfit.experiment.report_tables import markdown_table, rich_table
 
 _MARKS = {"extrapolated": "~", "at most": "<", "measured": "", "never": ""}
 _TITLES = {"stream": "a stream of {contexts} contexts", "contexts": "{single} contexts, one by one (medians)"}
@@ -170,29 +170,15 @@ def terminal_table(result: dict[str, Any]) -> RenderableType:
     """Both groups and the winners as rich tables."""
     parts: list[RenderableType] = []
     for group in ("stream", "contexts"):
-        parts.append(_rich(_title(result, group), table(result, group)))
-    parts.append(_rich("Least error after so much time", winner_table(result)))
+        parts.append(rich_table(_title(result, group), table(result, group)))
+    parts.append(rich_table("Least error after so much time", winner_table(result)))
     return Group(*parts, caption(result))
-
-
-def _rich(title: str, lines: list[list[str]]) -> Table:
-    made = Table(title=title, title_justify="left", title_style="bold")
-    for k, head in enumerate(lines[0]):
-        made.add_column(head, justify="left" if k == 0 or not head else "right", overflow="fold")
-    for line in lines[1:]:
-        made.add_row(*line)
-    return made
 
 
 def markdown(result: dict[str, Any]) -> str:
     """The same as Markdown."""
     parts = []
     for group in ("stream", "contexts"):
-        parts.append(_markdown(_title(result, group), table(result, group)))
-    parts.append(_markdown("Least error after so much time", winner_table(result)))
+        parts.append(markdown_table(_title(result, group), table(result, group)))
+    parts.append(markdown_table("Least error after so much time", winner_table(result)))
     return "\n".join([*parts, caption(result), ""])
-
-
-def _markdown(title: str, lines: list[list[str]]) -> str:
-    rule = ["---", *["---:"] * (len(lines[0]) - 1)]
-    return f"# {title}\n\n" + "\n".join("| " + " | ".join(x) + " |" for x in [lines[0], rule, *lines[1:]]) + "\n"

@@ -212,3 +212,14 @@ class LightDistribution(Distribution):
         # will see.
         omega = self.sample(u)
         return omega, self.log_prob(omega)
+
+
+class LightProposal(Proposal):
+    """Directions by a light's own law, whatever the context."""
+
+    def __init__(self, light: Light, law: type[LightDistribution]) -> None:
+        super().__init__()
+        self.light, self.law = light, law
+
+    def forward(self, context: Context) -> LightDistribution:
+        return self.law(self.light, context)

@@ -17,7 +17,7 @@ from dsfit.arguments import check_directions, check_uniforms
 from dsfit.context import Context
 from dsfit.frame import HALF_PI, cos_inclination, to_angles, to_vector
 from dsfit.proposals.base import Proposal
-from dsfit.scene.lights.base import Light, LightDistribution, tidy
+from dsfit.scene.lights.base import Light, LightDistribution, LightProposal, tidy
 from dsfit.scene.lights.lobes import orthonormal
 
 SLACK = 12
@@ -100,7 +100,7 @@ class ConeLight(Light):
 
     def proposal(self) -> Proposal:
         """Uniform in the cone; two uniforms."""
-        return ConeProposal(self)
+        return LightProposal(self, ConeDistribution)
 
     def _single(self) -> tuple[float, float, float]:
         """Inclination and azimuth of the axis and the angle of the only cone."""
@@ -134,17 +134,6 @@ class ConeLight(Light):
         sine = math.sin(angle) / math.cos(theta)
         reach = math.asin(sine) if sine < 1 and angle < HALF_PI else math.pi
         return theta_i.new_tensor([phi, phi]), torch.stack([-offset, offset], dim=-1), theta_i.new_tensor([reach] * 2)
-
-
-class ConeProposal(Proposal):
-    """Uniform directions in the cone of a sun or a sphere; two uniforms."""
-
-    def __init__(self, light: ConeLight) -> None:
-        super().__init__()
-        self.light = light
-
-    def forward(self, context: Context) -> ConeDistribution:
-        return ConeDistribution(self.light, context)
 
 
 class ConeDistribution(LightDistribution):

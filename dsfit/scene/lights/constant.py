@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from dsfit.arguments import check_directions, check_uniforms
-from dsfit.context import Context
 from dsfit.errors import InputError, as_real, check_range
 from dsfit.proposals.base import Proposal
-from dsfit.scene.lights.base import Light, LightDistribution
+from dsfit.scene.lights.base import Light, LightDistribution, LightProposal
 
 
 class ConstantLight(Light):
@@ -54,18 +53,7 @@ class ConstantLight(Light):
 
     def proposal(self) -> Proposal:
         """Uniform directions, also for a black light."""
-        return ConstantLightProposal(self)
-
-
-class ConstantLightProposal(Proposal):
-    """Uniform directions on the sphere; two uniforms."""
-
-    def __init__(self, light: ConstantLight) -> None:
-        super().__init__()
-        self.light = light
-
-    def forward(self, context: Context) -> ConstantLightDistribution:
-        return ConstantLightDistribution(self.light, context)
+        return LightProposal(self, ConstantLightDistribution)
 
 
 class ConstantLightDistribution(LightDistribution):

@@ -27,12 +27,11 @@ import torch
 from torch import Tensor
 
 from dsfit.arguments import check_directions, check_uniforms
-from dsfit.context import Context
 from dsfit.errors import InputError, as_number, as_real
 from dsfit.frame import to_angles
 from dsfit.proposals.base import Proposal
 from dsfit.scene.exr import read_exr
-from dsfit.scene.lights.base import Light, LightDistribution, around, tidy
+from dsfit.scene.lights.base import Light, LightDistribution, LightProposal, around, tidy
 from dsfit.scene.lights.environment_native import Prepared
 
 _PI = math.pi
@@ -185,7 +184,7 @@ class EnvironmentLight(Light):
 
     def proposal(self) -> Proposal:
         """Directions by the map's luminance; exact density, positive wherever the radiance is."""
-        return EnvironmentProposal(self)
+        return LightProposal(self, EnvironmentDistribution)
 
     def breakpoints(self) -> tuple[list[float], list[float]]:
         """Texels far brighter than the mean; for a small map with its pole along the tangent, all texel lines.
@@ -230,19 +229,11 @@ def _at(table: Tensor, place: Tensor) -> Tensor:
     return table.reshape(-1).index_select(0, place.reshape(-1)).reshape(place.shape)
 
 
-class EnvironmentProposal(Proposal):
-    """Directions by the luminance of an environment map; two uniforms (sine of latitude, longitude)."""
-
-    def __init__(self, light: EnvironmentLight) -> None:
-        super().__init__()
-        self.light = light
-
-    def forward(self, context: Context) -> EnvironmentDistribution:
-        return EnvironmentDistribution(self.light, context)
-
-
 class EnvironmentDistribution(LightDistribution):
-    """p = bilinear(luminance; sin latitude, longitude) / integral. Tables and sampling are float64."""
+    """p = bilinear(luminance; sin latitude, longitude) / integral. Tables and sampling are float64.
+
+    Uniforms: sine of latitude, longitude.
+    """
 
     dimension = 2
     light: EnvironmentLight

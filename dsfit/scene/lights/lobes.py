@@ -17,7 +17,7 @@ from dsfit.context import Context
 from dsfit.errors import InputError, as_real, check_choice, check_range
 from dsfit.frame import to_angles, to_vector
 from dsfit.proposals.base import Proposal
-from dsfit.scene.lights.base import Light, LightDistribution, around, tidy
+from dsfit.scene.lights.base import Light, LightDistribution, LightProposal, around, tidy
 
 MAX_KAPPA = 1e6
 LOG_TWO_PI = math.log(2 * math.pi)
@@ -155,7 +155,7 @@ class VonMisesFisherLights(Light):
 
     def proposal(self) -> Proposal:
         """Exact mixture of the lobes and a uniform part for the ambient, by power averaged over the channels."""
-        return LobesProposal(self)
+        return LightProposal(self, LobesDistribution)
 
     def breakpoints(self) -> tuple[list[float], list[float]]:
         """The peaks, and multiples of 1/sqrt(kappa) on both sides of each lobe with kappa > 10."""
@@ -172,19 +172,11 @@ class VonMisesFisherLights(Light):
         return tidy(thetas, phis)
 
 
-class LobesProposal(Proposal):
-    """Mixture of von Mises-Fisher laws; three uniforms (which lobe, inclination to its axis, azimuth around it)."""
-
-    def __init__(self, light: VonMisesFisherLights) -> None:
-        super().__init__()
-        self.light = light
-
-    def forward(self, context: Context) -> LobesDistribution:
-        return LobesDistribution(self.light, context)
-
-
 class LobesDistribution(LightDistribution):
-    """p = sum_k P_k C(kappa_k) exp(kappa_k (w . mu_k - 1)) + P_0 / (4 pi), P by the mean power of the channels."""
+    """p = sum_k P_k C(kappa_k) exp(kappa_k (w . mu_k - 1)) + P_0 / (4 pi), P by the mean power of the channels.
+
+    Uniforms: which lobe, inclination to its axis, azimuth around it.
+    """
 
     dimension = 3
     light: VonMisesFisherLights

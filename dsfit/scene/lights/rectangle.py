@@ -12,7 +12,7 @@ from dsfit.arguments import check_directions, check_uniforms
 from dsfit.context import Context
 from dsfit.errors import InputError
 from dsfit.proposals.base import Proposal
-from dsfit.scene.lights.base import LightDistribution
+from dsfit.scene.lights.base import LightDistribution, LightProposal
 from dsfit.scene.lights.nearby import NearbyLight, check_length, check_radiance, check_vector
 from dsfit.scene.lights.outlines import Outline, segment
 from dsfit.scene.lights.spherical_rectangle import SphericalRectangle
@@ -115,22 +115,14 @@ class RectangleLight(NearbyLight):
 
     def proposal(self) -> Proposal:
         """Uniform in the rectangle's solid angle; two uniforms."""
-        return RectangleProposal(self)
-
-
-class RectangleProposal(Proposal):
-    """Uniform directions to a rectangle; two uniforms (along edge_u, along edge_v)."""
-
-    def __init__(self, light: RectangleLight) -> None:
-        super().__init__()
-        self.light = light
-
-    def forward(self, context: Context) -> RectangleDistribution:
-        return RectangleDistribution(self.light, context)
+        return LightProposal(self, RectangleDistribution)
 
 
 class RectangleDistribution(LightDistribution):
-    """p = 1 / solid angle on the rectangle, 0 beside it; 1 / (4 pi) everywhere for points in its plane."""
+    """p = 1 / solid angle on the rectangle, 0 beside it; 1 / (4 pi) everywhere for points in its plane.
+
+    Uniforms: along edge_u, along edge_v.
+    """
 
     dimension = 2
 

@@ -12,7 +12,7 @@ from dsfit.arguments import check_directions, check_uniforms
 from dsfit.context import Context
 from dsfit.errors import InputError, as_real, check_range
 from dsfit.proposals.base import Proposal
-from dsfit.scene.lights.base import LightDistribution
+from dsfit.scene.lights.base import LightDistribution, LightProposal
 from dsfit.scene.lights.lobes import orthonormal
 from dsfit.scene.lights.nearby import NearbyLight, check_length, check_radiance, check_vector
 from dsfit.scene.lights.outlines import Outline, circle
@@ -127,7 +127,7 @@ class RingLight(NearbyLight):
 
     def proposal(self) -> Proposal:
         """Nearly uniform in the ring's solid angle, with exact density; two uniforms."""
-        return RingProposal(self)
+        return LightProposal(self, RingDistribution)
 
 
 def _frame(axis: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
@@ -140,19 +140,11 @@ def _frame(axis: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
     return torch.linalg.cross(second, axis, dim=-1), second
 
 
-class RingProposal(Proposal):
-    """Directions to a ring; two uniforms (around its centre, from it)."""
-
-    def __init__(self, light: RingLight) -> None:
-        super().__init__()
-        self.light = light
-
-    def forward(self, context: Context) -> RingDistribution:
-        return RingDistribution(self.light, context)
-
-
 class RingDistribution(LightDistribution):
-    """p = p(alpha) / M(alpha) on the ring (see `SphericalRing`); 1 / (4 pi) everywhere for points in its plane."""
+    """p = p(alpha) / M(alpha) on the ring (see `SphericalRing`); 1 / (4 pi) everywhere for points in its plane.
+
+    Uniforms: around its centre, from it.
+    """
 
     dimension = 2
 
