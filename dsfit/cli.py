@@ -1,5 +1,6 @@
 """The command line: `dsfit run CONFIG`, `dsfit check CONFIG`, `dsfit bench CONFIG`, `dsfit render CONFIG`,
-`dsfit compare-images A.exr REF.exr`, `dsfit plan CONFIG`, `dsfit export CONFIG`, `dsfit show RUNDIR`, `dsfit presets`.
+`dsfit compare-images A.exr REF.exr`, `dsfit plan CONFIG`, `dsfit export CONFIG`, `dsfit show RUNDIR`, `dsfit presets`,
+`dsfit figures list|run|draw`.
 
 Exit codes: 0 done, 1 the run failed (what is done is kept), 2 the config or an argument is wrong (nothing was
 written), 3 a check was not passed, 130 interrupted.
@@ -14,6 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 from rich.console import Console
 
+from dsfit.figures.command import app as figures
+
 if TYPE_CHECKING:
     from dsfit.experiment.rundir import RunDirectory
 
@@ -23,6 +26,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(figures, name="figures")
 
 
 @app.callback()

@@ -33,22 +33,34 @@ def version() -> str:
 _SOURCES = (".py", ".cpp", ".h", ".hpp")
 
 
+# what only shows numbers: a change there leaves every number as it was
+_SHOWING = ("cli.py", "figures/", "report/", "sweep/", "experiment/plots/")
+
+
 @cache
-def sources_hash(packages: tuple[str, ...] = ()) -> str:
-    """Hash of the sources of dsfit, or of these packages of it and the modules beside them."""
+def sources_hash(packages: tuple[str, ...] = (), numbers: bool = False) -> str:
+    """Hash of the sources of dsfit, or of these packages of it and the modules beside them; with `numbers`, without
+    what only shows numbers."""
     root = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
     for path in sorted(path for path in root.rglob("*") if path.suffix in _SOURCES):
         name = path.relative_to(root)
         if packages and len(name.parts) > 1 and name.parts[0] not in packages:
             continue
+        if numbers and name.as_posix().startswith(_SHOWING):
+            continue
         digest.update(name.as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()[:12]
 
 
 def code_version() -> str:
-    """Package version and a hash of all its sources: any change to the code makes another run."""
+    """Package version and a hash of all its sources."""
     return f"{version()}+{sources_hash()}"
+
+
+def numbers_version() -> str:
+    """Package version and a hash of the sources that decide numbers: any change there makes another run."""
+    return f"{version()}+{sources_hash(numbers=True)}"
 
 
 def run_id(config: Config) -> str:
@@ -64,7 +76,7 @@ def run_id(config: Config) -> str:
         from dsfit.experiment.checking import files_of
 
         data["files"] = [hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in files_of(config)]
-    identity = json.dumps([data, code_version()], sort_keys=True)
+    identity = json.dumps([data, numbers_version()], sort_keys=True)
     return hashlib.sha256(identity.encode()).hexdigest()[:12]
 
 

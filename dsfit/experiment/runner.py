@@ -22,7 +22,7 @@ from dsfit.experiment.rundir import RunDirectory, RunFailure
 from dsfit.experiment.schema import SCHEMA_VERSION, Config
 from dsfit.experiment.validation import Experiment
 
-_ONE_THREAD = {
+ONE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
@@ -242,7 +242,7 @@ def _in_processes(
     spawn = multiprocessing.get_context("spawn")
     queue = spawn.Queue()
     failures: list[tuple[Job, str]] = []
-    with _environment(_ONE_THREAD):
+    with _environment(ONE_THREAD):
         pool = ProcessPoolExecutor(workers, mp_context=spawn, initializer=_start_worker, initargs=(queue,))
         try:
             futures: dict[Future[str | None], Job] = {

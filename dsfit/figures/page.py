@@ -1,0 +1,40 @@
+"""The page that figures are made for: widths in the text block of a thesis, sizes of type, and saving."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from dsfit.experiment.plots.style import new_figure, save
+
+MILLIMETRE = 1 / 25.4
+
+
+@dataclass(frozen=True)
+class Page:
+    """The text block.
+
+    Attributes:
+        width_mm: its width; figures are as wide.
+    """
+
+    width_mm: float = 150.0
+
+    @property
+    def width(self) -> float:
+        """Width in inches, matplotlib's unit."""
+        return self.width_mm * MILLIMETRE
+
+    def figure(self, height: float) -> Figure:
+        """An empty figure as wide as the text; `height` in units of its width."""
+        return new_figure(self.width, self.width * height)
+
+    def adopt(self, figure: Figure) -> Figure:
+        """A figure made for another width, brought to this one with its type, lines and marks."""
+        raise NotImplementedError
+
+    def save(self, figure: Figure, folder: Path, name: str) -> list[Path]:
+        """Write it as PNG and PDF."""
+        return save(figure, folder, name)

@@ -1,0 +1,25 @@
+"""`python -m dsfit.figures.worker JOB`: makes one experiment and prints what it does, at last what it did, as JSON."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+
+def main(text: str) -> None:
+    """Make the experiment that the job (JSON) names."""
+    import torch
+
+    from dsfit.figures.catalogue import find
+    from dsfit.figures.make import make
+
+    torch.set_num_threads(1)
+    job = json.loads(text)
+    entry = find(job.pop("root"), job.pop("name"))
+    done = make(entry, Path(job.pop("out")), job.pop("overrides"), say=lambda what: print(what, flush=True), **job)
+    print(json.dumps(done), flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
