@@ -8,6 +8,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from dsfit.experiment.plots.style import new_figure, save
+from dsfit.figures.adopt import adopt
 
 MILLIMETRE = 1 / 25.4
 
@@ -32,8 +33,9 @@ class Page:
         return new_figure(self.width, self.width * height)
 
     def adopt(self, figure: Figure) -> Figure:
-        """A figure made for another width, brought to this one with its type, lines and marks."""
-        raise NotImplementedError
+        """A figure made for another width, brought to this one with its type (not below 5.5 pt), lines and marks."""
+        adopt(figure, self.width)
+        return figure
 
     def save(self, figure: Figure, folder: Path, name: str) -> list[Path]:
         """Write it as PNG and PDF."""
