@@ -27,6 +27,16 @@ def box_muller(u1: Tensor, u2: Tensor) -> Tensor:
     return torch.sqrt(-2 * torch.log(u1)) * torch.cos(TWO_PI * u2)
 
 
+def cosine_cdf(phi: Tensor) -> Tensor:
+    """The CDF printed before (31), of the density (30): it ends at 4."""
+    return 2 * (torch.sin(phi / 2) + 1)
+
+
+def transmittance_cdf(theta_d: Tensor) -> Tensor:
+    """Chapter eq (34), the CDF of the density (33): it ends at 2."""
+    return 1 + torch.sin(theta_d)
+
+
 class PrintedDistribution(Distribution):
     """Sampler and claimed density of a control, for one batch of contexts."""
 

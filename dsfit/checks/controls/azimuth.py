@@ -21,6 +21,7 @@ from dsfit.mis import estimate
 from dsfit.proposals.azimuth import CosineHalf
 from dsfit.proposals.base import Product, Proposal
 from dsfit.proposals.printed import AzimuthClamped, CosineAsPrinted, FrontAsPrinted
+from dsfit.proposals.printed import cosine_cdf as printed_cdf
 from dsfit.proposals.uniform import FrontHemisphere, UniformInclination, UniformSphere
 from dsfit.quadrature import panel_points
 from dsfit.quality import reference
@@ -186,7 +187,7 @@ def bare_azimuth(seed: int) -> Trial:
 def cosine_cdf(seed: int) -> Trial:
     phi = torch.linspace(-math.pi, math.pi, 33, dtype=torch.float64)
     mass = torch.stack([_integral(lambda x: torch.cos(x / 2) / 4, -math.pi, float(end)) for end in phi])
-    printed, corrected = 2 * (torch.sin(phi / 2) + 1), (1 + torch.sin(phi / 2)) / 2
+    printed, corrected = printed_cdf(phi), (1 + torch.sin(phi / 2)) / 2
     gap = [float((p - mass).abs().max()) for p in (printed, corrected)]
     return Trial(gap[0], gap[1], 1e-12, f"P(π) = {float(printed[-1]):.0f}", {"end": float(printed[-1])})
 

@@ -22,6 +22,7 @@ from dsfit.fit.transmittance import TransmittanceFit, fit_transmittance
 from dsfit.frame import HALF_PI
 from dsfit.proposals.base import Product
 from dsfit.proposals.printed import TransmittanceInclinationAsPrinted
+from dsfit.proposals.printed import transmittance_cdf as printed_cdf
 from dsfit.proposals.transmittance import TransmittanceCosine
 from dsfit.proposals.uniform import UniformAzimuth, UniformSphere
 from dsfit.quadrature import panel_points
@@ -59,7 +60,7 @@ def transmittance_mass(seed: int) -> Trial:
 def transmittance_cdf(seed: int) -> Trial:
     ends = torch.linspace(-HALF_PI, HALF_PI, 33, dtype=torch.float64)
     mass = torch.stack([_cosine_mass(float(end)) for end in ends])
-    printed, corrected = 1 + torch.sin(ends), (1 + torch.sin(ends)) / 2
+    printed, corrected = printed_cdf(ends), (1 + torch.sin(ends)) / 2
     gap = [float((p - mass).abs().max()) for p in (printed, corrected)]
     return Trial(gap[0], gap[1], 1e-12, f"P(π/2) = {float(printed[-1]):.0f}", {"end": float(printed[-1])})
 
