@@ -11,6 +11,7 @@ from typing import Any
 from rich.table import Table
 
 from dsfit.errors import InputError
+from dsfit.experiment.about import About, about, digest
 from dsfit.render.images import Flip, ImageErrors, RenderImage, hdr_flip, image_errors, read_image
 from dsfit.render.images.metrics import Corrected
 
@@ -50,16 +51,20 @@ def compare_files(image: Path, reference: Path, out: Path | None = None) -> Comp
     if names[0] == names[1]:  # image.exr of two runs
         names = tuple(f"{path.resolve().parent.name}-{path.stem}" for path in (image, reference))
     picture = folder / f"{names[0]}-against-{names[1]}.png"
-    _draw(pair, errors, flip, " against ".join(names), picture)
+    title = " against ".join(names)
+    source = about(title, data=digest(path.read_bytes() for path in (image, reference)))
+    _draw(pair, errors, flip, title, picture, source)
     return Comparison(*pair, errors, flip, picture)
 
 
-def _draw(pair: tuple[RenderImage, RenderImage], errors: ImageErrors, flip: Flip, title: str, path: Path) -> None:
+def _draw(
+    pair: tuple[RenderImage, RenderImage], errors: ImageErrors, flip: Flip, title: str, path: Path, source: About
+) -> None:
     from dsfit.experiment.plots.render_maps import error_maps
     from dsfit.experiment.plots.style import styled, write_figure
 
     with styled():
-        write_figure(error_maps(*pair, errors.eps, flip, title), path)
+        write_figure(error_maps(*pair, errors.eps, flip, title), path, source)
 
 
 def rows(found: Comparison) -> list[tuple[str, str, str, str]]:

@@ -6,7 +6,7 @@ import json
 import math
 import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from dsfit.errors import InputError
+from dsfit.experiment.about import KEY, about, array_hash, exr_attributes, plain_hash, to_text
 from dsfit.experiment.compare_render_curve import climb, slope
 from dsfit.experiment.compare_render_painter import Painter, picture_of
 from dsfit.experiment.compare_render_reference import agreement, centred, own_error, reference_image
@@ -213,8 +214,10 @@ class _Cell:
 def _write(config: Config, directory: RunDirectory, stem: str, image: RenderImage, reference: RenderImage) -> None:
     folder = directory.path / "images"
     folder.mkdir(parents=True, exist_ok=True)
-    write_image(folder / f"{stem}.exr", image)
-    write_png(folder / f"{stem}.png", tone_map(config, reference)(image.radiance))
+    settings, data = plain_hash(config.model_dump(exclude_none=True)), array_hash(image.radiance.numpy())
+    source = about(directory.path.name, picture=stem, settings=settings, data=data)
+    write_image(folder / f"{stem}.exr", replace(image, attributes={**image.attributes, **exr_attributes(source)}))
+    write_png(folder / f"{stem}.png", tone_map(config, reference)(image.radiance), {KEY: to_text(source)})
 
 
 def tone_map(config: Config, reference: RenderImage) -> ToneMap:

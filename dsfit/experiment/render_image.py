@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dsfit.errors import InputError
-from dsfit.experiment import files, provenance
+from dsfit.experiment import about, files, provenance
 from dsfit.experiment.files import number
 from dsfit.experiment.render import proposal_path
 from dsfit.experiment.rundir import RunDirectory
@@ -19,7 +20,7 @@ from dsfit.experiment.schema import SCHEMA_VERSION, Config
 from dsfit.experiment.schema_render import RenderConfig
 from dsfit.render.images import RenderImage, ToneMap, read_image, write_image, write_png
 
-_COLORED = ("radiance", "variance")
+_LONG_OR_TIMED = ("config", "technique", "machine", "seconds", "wallSeconds")
 
 
 def image_path(directory: RunDirectory) -> Path:
@@ -34,6 +35,8 @@ def finish(directory: RunDirectory, result: dict[str, Any], config: Config) -> d
         InputError: radiance that is not finite (image.exr is there and shows where).
     """
     image = assemble(directory, result["cells"], config, attributes(result, config))
+    data = {"dsfit.data": about.array_hash(image.radiance.numpy())}
+    image = replace(image, attributes={**image.attributes, **data})
     write_image(image_path(directory), image)
     tone_map = develop(directory, config.render)
     return {**summary(image, result), "training": _training(directory), "tone_map": tone_map.describe()}
@@ -67,7 +70,12 @@ def develop(directory: RunDirectory, render: RenderConfig) -> ToneMap:
     """
     image = read_image(image_path(directory))
     tone_map = ToneMap(render.exposure, render.tone_map).fixed(image.radiance, image.covered)
-    text = {"Software": f"dsfit {provenance.code_version()}", "Tone map": tone_map.describe()}
+    source = {k: v for k, v in about.from_exr(image.attributes).items() if k not in _LONG_OR_TIMED}
+    text = {
+        "Software": f"dsfit {provenance.code_version()}",
+        "Tone map": tone_map.describe(),
+        about.KEY: about.to_text(source),
+    }
     write_png(directory.path / "image.png", tone_map(image.radiance), text)
     return tone_map
 
@@ -85,12 +93,10 @@ def is_whole(directory: RunDirectory, render: RenderConfig) -> bool:
 def attributes(result: dict[str, Any], config: Config) -> dict[str, Any]:
     """Where an image comes from, as attributes of its file."""
     record, render = result["provenance"], config.render
-    git, machine = record.get("git"), record["machine"]
-    commit = "unknown" if git is None else git["commit"] + (" with changes" if git["changed"] else "")
+    machine = record["machine"]
+    source = about.about(result["name"], record, run=result["run_id"], settings=about.plain_hash(result["config"]))
     return {
-        "dsfit.version": record["dsfit"],
-        "dsfit.run": result["run_id"],
-        "dsfit.git": commit,
+        **about.exr_attributes(source),
         "dsfit.title": result["title"] or result["name"],
         "dsfit.seed": str(render.seed),
         "dsfit.technique": json.dumps(render.technique.model_dump(), sort_keys=True),

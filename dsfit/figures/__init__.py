@@ -7,10 +7,23 @@ An experiment is a module of the folder `experiments`: `experiments/NAME.py` say
 
 from __future__ import annotations
 
+from dsfit.experiment.about import read_about
 from dsfit.experiment.sections import Section as Settings
 from dsfit.figures.data import Data
 from dsfit.figures.experiment import Experiment, Work
 from dsfit.figures.rules import Close, Estimate, Exact, Measured, Rule
 from dsfit.figures.table import Table
 
-__all__ = ["Close", "Data", "Estimate", "Exact", "Experiment", "Measured", "Rule", "Settings", "Table", "Work"]
+__all__ = [
+    "Close",
+    "Data",
+    "Estimate",
+    "Exact",
+    "Experiment",
+    "Measured",
+    "Rule",
+    "Settings",
+    "Table",
+    "Work",
+    "read_about",
+]

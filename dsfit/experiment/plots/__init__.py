@@ -8,6 +8,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from dsfit.experiment.about import about_run
 from dsfit.experiment.plots.checks import checks
 from dsfit.experiment.plots.convergence import convergence
 from dsfit.experiment.plots.excess import excess_bars, excess_grid
@@ -21,9 +22,10 @@ __all__ = ["draw_all"]
 def draw_all(directory: RunDirectory, result: dict[str, Any]) -> list[Path]:
     """Draw every figure that this kind of experiment has; returns the files written."""
     written: list[Path] = []
+    source = about_run(directory, result)
     with styled():
         for name, figure in _figures(directory, result):
-            written += save(figure, directory.path / "figures", name)
+            written += save(figure, directory.path / "figures", name, source)
     return written
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from dsfit.experiment.about import KEY, About, to_text
+from dsfit.experiment.about import about as make_about
 from dsfit.experiment.files import write_bytes
 
 # Okabe and Ito's palette with grey for its yellow, which is too light for lines on white.
@@ -55,20 +57,40 @@ def look(index: int) -> dict[str, Any]:
     return {"color": COLORS[index % len(COLORS)], "marker": MARKERS[index % len(MARKERS)]}
 
 
-def save(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Write `name.png` and `name.pdf` atomically; returns the two paths."""
+def save(
+    figure: Figure, folder: Path, name: str, about: About | None = None, kinds: Sequence[str] = ("png", "pdf")
+) -> list[Path]:
+    """Write `name.png` and `name.pdf` atomically; returns the paths.
+
+    Args:
+        figure: what to write.
+        folder: where.
+        name: file name without suffix.
+        about: where it comes from, from `dsfit.experiment.about`; left out, the present code and packages.
+        kinds: suffixes of the files.
+    """
     _plain(figure)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # laid out once, not once more for every format
-    return [write_figure(figure, folder / f"{name}.{kind}") for kind in ("png", "pdf")]
+    return [write_figure(figure, folder / f"{name}.{kind}", about) for kind in kinds]
 
 
-def write_figure(figure: Figure, path: Path) -> Path:
-    """Write the figure atomically in the format that the name ends with."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=path.suffix.removeprefix("."))
+def write_figure(figure: Figure, path: Path, about: About | None = None) -> Path:
+    """Write the figure atomically in the format that the name ends with, and in it where it comes from."""
+    about = make_about(path.stem) if about is None else about
+    kind, buffer = path.suffix.removeprefix("."), io.BytesIO()
+    figure.savefig(buffer, format=kind, metadata=_metadata(kind, path.stem, about))
     write_bytes(path, buffer.getvalue())
     return path
+
+
+def _metadata(kind: str, name: str, about: About) -> dict[str, Any]:
+    """Under the names that the format has; a PDF's date is left out, so that bytes repeat."""
+    maker = f"dsfit {about['dsfit']}"
+    if kind == "png":
+        return {"Title": f"{about['name']}: {name}", "Software": maker, KEY: to_text(about)}
+    title = f"{about['name']}: {name}"
+    return {"Title": title, "Creator": maker, "Keywords": to_text(about), "CreationDate": None}
 
 
 def _plain(figure: Figure) -> None:
