@@ -25,6 +25,7 @@ _PUBLIC = {
     "Fiber": "dsfit.bsdf",
     "FiberFamily": "dsfit.proposals.fiber_family",
     "Fit": "dsfit.fit",
+    "FunctionIntegrand": "dsfit.scene",
     "HairKernel": "dsfit.kernels",
     "HeldOut": "dsfit.fit.amortise",
     "InputError": "dsfit.errors",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dsfit.scene.exr import ExrImage, read_exr, write_exr
+from dsfit.scene.function_integrand import FunctionIntegrand
 from dsfit.scene.integrand import Integrand
 from dsfit.scene.lights import (
     ConstantLight,
@@ -22,6 +23,7 @@ __all__ = [
     "ConstantScattering",
     "EnvironmentLight",
     "ExrImage",
+    "FunctionIntegrand",
     "Integrand",
     "Light",
     "RectangleLight",
