@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from dsfit.figures.latex import table
+
 
 @dataclass(frozen=True)
 class Table:
@@ -40,3 +42,8 @@ class Table:
         cells = [[str(cell).replace("|", "\\|") for cell in row] for row in (self.head, *self.rows)]
         lines = [cells[0], rule, *cells[1:]]
         return "\n".join("| " + " | ".join(line) + " |" for line in lines) + f"\n\n{self.caption}\n"
+
+    def latex(self, label: str = "") -> str:
+        """The table in LaTeX with booktabs' rules, caption and label (`tab:NAME` if none is given); it takes
+        `\\usepackage{array,booktabs,graphicx,longtable}`."""
+        return table(self, label or f"tab:{self.name}")
