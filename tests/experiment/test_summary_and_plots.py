@@ -127,3 +127,17 @@ def test_small_helpers() -> None:
         "-",
     ]
     assert [summary._time(x) for x in (2.0, 0.0123, 4.5e-6, 3e-9)] == ["2 s", "12.3 ms", "4.5 us", "3 ns"]
+
+
+def test_labels_of_minor_ticks_stay_formulas(tmp_path: Path) -> None:
+    from dsfit.experiment.plots.style import new_figure, save
+
+    figure = new_figure(3.0, 3.0)
+    axes = figure.subplots()
+    axes.plot([0, 1], [4, 9])
+    axes.set(yscale="log", title="costs $1 to $2")
+    save(figure, tmp_path, "ticks")
+    labels = axes.yaxis.get_ticklabels(minor=True)
+    assert any("$" in label.get_text() for label in labels)
+    assert all(label.get_parse_math() for label in labels)
+    assert not axes.title.get_parse_math()

@@ -95,7 +95,12 @@ def _metadata(kind: str, name: str, about: About) -> dict[str, Any]:
 
 def _plain(figure: Figure) -> None:
     """Titles and labels as they are: two dollars in a method's name do not start a formula (those of ticks do)."""
-    ticks = {id(label) for axes in figure.axes for axis in (axes.xaxis, axes.yaxis) for label in axis.get_ticklabels()}
+    ticks = {
+        id(label)
+        for axes in figure.axes
+        for axis in (axes.xaxis, axes.yaxis)
+        for label in axis.get_ticklabels(which="both")
+    }
     for text in figure.findobj(Text):
         if id(text) not in ticks:
             text.set_parse_math(False)
