@@ -1,74 +1,91 @@
-"""Expected numbers n against counted ones N: bias, scatter, and what images make of them."""
+"""Expected numbers n against counted ones N: bias, scatter, what images make of them, and standard errors of each."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
 EDGES = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, math.inf)
 ALBEDOS = (0.3, 0.7)
+GROUPS = 20
+"""Of rays, one of which the jackknife leaves out at a time."""
 _RAYS_IN_BIN = 60
+_LEAST_IN_BIN = 10
 
 
-def compare(n: Tensor, exact: Tensor, few: Tensor, *, bins: bool = True) -> dict[str, Any]:
-    """All numbers for rays with expected n and counted N, `[K]` each; `few` `[K]` says which are expected to meet few.
+def compare(n: Tensor, exact: Tensor) -> dict[str, float]:
+    """All numbers for rays with expected n and counted N, `[K]` each.
 
-    mean_n, mean_N, error: means, and the standard error of their difference.
-    few: mean of n - N over those that are to meet few, and its standard error.
-    scatter, poisson: RMS of N about its mean at given n, and what Poisson numbers of that mean have.
+    mean_n, mean_N, bias: means, and mean_n / mean_N - 1.
+    few: mean of n - N over rays that are to meet few fibres, n <= 1.
+    scatter: RMS of N about its mean at given n, over that of Poisson numbers of that mean; `deviation` not divided.
     zero, exp: share of rays with N = 0, and mean of exp(-n).
-    powers: mean of a^N, and of its mean exp(-n (1 - a)) for Poisson numbers, by a.
-    rule: share of rays that the thesis's rule, n <= 1/2, calls lit; that it gets wrong; wrongly lit; wrongly dark.
-    brier: mean square of v - [N = 0], by rule.
+    power_a, mean_power_a: mean of a^N, and of its mean exp(-n (1 - a)) for Poisson numbers, for every a of `ALBEDOS`.
+    wrong, wrongly_lit, wrongly_dark: share of rays that the thesis's rule, lit where n <= 1/2, gets wrong.
+    brier_poisson, brier_threshold: mean square of v - [N = 0], with v = exp(-n) and by the rule.
     """
     lit, called = exact == 0, n <= 0.5
     hit = lit.to(n)
-    scatter, poisson = spread(n, exact)
-    rest = (n - exact)[few]
-    result: dict[str, Any] = {
-        "mean_n": float(n.mean()),
-        "mean_N": float(exact.mean()),
-        "error": float((n - exact).std()) / math.sqrt(len(n)),
-        "few": [float(rest.mean()), float(rest.std()) / math.sqrt(max(len(rest), 1))],
-        "scatter": scatter,
-        "poisson": poisson,
-        "zero": float(hit.mean()),
-        "exp": float(torch.exp(-n).mean()),
-        "powers": {f"{a:g}": [float((a**exact).mean()), float(torch.exp(-n * (1 - a)).mean())] for a in ALBEDOS},
-        "rule": {
-            "lit": float(called.to(n).mean()),
-            "wrong": float((called != lit).to(n).mean()),
-            "wrongly_lit": float((called & ~lit).to(n).mean()),
-            "wrongly_dark": float((~called & lit).to(n).mean()),
-        },
-        "brier": {
-            "poisson": float((torch.exp(-n) - hit).square().mean()),
-            "threshold": float((called.to(n) - hit).square().mean()),
-        },
+    deviation, poisson = spread(n, exact)
+    found = {
+        "mean_n": n.mean(),
+        "mean_N": exact.mean(),
+        "bias": n.mean() / exact.mean() - 1,
+        "few": (n - exact)[n <= 1].mean(),
+        "deviation": deviation,
+        "scatter": deviation / poisson,
+        "zero": hit.mean(),
+        "exp": torch.exp(-n).mean(),
+        "wrong": (called != lit).to(n).mean(),
+        "wrongly_lit": (called & ~lit).to(n).mean(),
+        "wrongly_dark": (~called & lit).to(n).mean(),
+        "brier_poisson": (torch.exp(-n) - hit).square().mean(),
+        "brier_threshold": (called.to(n) - hit).square().mean(),
     }
-    if bins:
-        result["bins"] = [
-            _bin(n, exact, (n >= low) & (n < high)) for low, high in zip(EDGES[:-1], EDGES[1:], strict=True)
-        ]
-    return result
+    for a in ALBEDOS:
+        found[f"power_{a:g}"] = (a**exact).mean()
+        found[f"mean_power_{a:g}"] = torch.exp(-n * (1 - a)).mean()
+    return {name: float(value) for name, value in found.items()}
 
 
-def _bin(n: Tensor, exact: Tensor, inside: Tensor) -> dict[str, float] | None:
-    """Means of the rays in a bin of n; None where there are fewer than ten."""
-    count = int(inside.sum())
-    if count < 10:
-        return None
-    n, exact = n[inside], exact[inside]
-    return {
-        "rays": count,
-        "n": float(n.mean()),
-        "N": float(exact.mean()),
-        "zero": float((exact == 0).to(n).mean()),
-        "exp": float(torch.exp(-n).mean()),
-    }
+def brief(n: Tensor, exact: Tensor) -> dict[str, float]:
+    """Bias, mean exp(-n) less the share of N = 0, and mean square of exp(-n) - [N = 0]."""
+    hit, v = (exact == 0).to(n), torch.exp(-n)
+    found = {"bias": n.mean() / exact.mean() - 1, "exp_less_zero": (v - hit).mean(), "brier": (v - hit).square().mean()}
+    return {name: float(value) for name, value in found.items()}
+
+
+def with_errors(statistics: Callable[..., dict[str, float]], *values: Tensor) -> dict[str, float]:
+    """`statistics(*values)` and their standard errors as `NAME_error`, by the jackknife over groups of rays; those of
+    shares are one ray's at least, where no ray of a kind was met."""
+    rays = len(values[0])
+    group = torch.arange(rays) % min(GROUPS, rays)
+    parts = [statistics(*(value[group != k] for value in values)) for k in range(int(group.max()) + 1)]
+    found = statistics(*values)
+    factor = math.sqrt(len(parts) - 1)
+    errors = {name: factor * float(np.std([part[name] for part in parts])) for name in found}
+    return found | {f"{name}_error": max(error, 1 / rays) for name, error in errors.items()}
+
+
+def bins(n: Tensor, exact: Tensor) -> dict[str, np.ndarray]:
+    """By bin of n, whose ends are `EDGES`: rays, mean n, share of N = 0 and its standard error (inf, and zeros for the
+    means, where there are fewer than ten rays)."""
+    rows = []
+    for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):
+        inside = (n >= low) & (n < high)
+        count = int(inside.sum())
+        if count < _LEAST_IN_BIN:
+            rows.append((count, 0.0, math.inf, 0.0, math.inf))
+            continue
+        share = float((exact[inside] == 0).to(n).mean())
+        error = math.sqrt(max(share * (1 - share), 1 / count) / count)
+        mean, mean_error = float(n[inside].mean()), float(n[inside].std()) / math.sqrt(count)
+        rows.append((count, mean, mean_error, share, error))
+    return dict(zip(("rays", "n", "n_error", "zero", "zero_error"), np.array(rows).T, strict=True))
 
 
 def spread(n: Tensor, exact: Tensor) -> tuple[float, float]:

@@ -1,27 +1,24 @@
 """Scatter counts from a grid of densities against exact counts of the geometry.
 
-    python experiments/scatter_counts.py --out DIR [--quick]     (measures: about five minutes)
-    python experiments/scatter_counts.py --plot DIR              (figure and table of what was measured)
-
 Rays start on fibres, at points spread evenly over their length or at points that a camera sees, and go in directions
 spread evenly over the sphere. N is the exact number of fibres that a ray meets, its own left out; n is what the grid
 expects. Were fibres placed independently of one another, N would be a Poisson number of mean n: that is what
-v = exp(-n) stands for. Writes scatter_counts.json, .png, .pdf and .md.
+v = exp(-n) stands for.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
+import math
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from _scatter_counts_compare import compare
 from torch import Tensor
 
+from dsfit.errors import InputError
+from dsfit.figures import Data, Estimate, Exact, Experiment, Measured, Settings, Work
 from dsfit.render import Strands
 from dsfit.render.camera import Camera
 from dsfit.render.exact_counts import exact_crossings
@@ -29,53 +26,69 @@ from dsfit.render.geometry import GENERATORS, suggested_view
 from dsfit.render.geometry.view import VIEWS
 from dsfit.render.grid import DensityGrid
 from dsfit.render.visibility import Visibility
+from experiments._scatter_counts_compare import bins, brief, compare, with_errors
 
-NAME = "scatter_counts.json"
-GEOMETRIES = ("block", "double_block", "wavy_bundle", "ball")
-RESOLUTIONS = (8, 12, 16, 24, 32, 48, 64, 96)
+POINTS = ("fibres", "seen")
 STEPS = (1.0, 0.5, 0.25)
 _FINEST = 1 / 16
 
 
-def compute(folder: Path, quick: bool) -> dict[str, Any]:
-    """Measure; also writes the data to `folder`."""
-    from dsfit.experiment.files import write_json
-    from dsfit.experiment.provenance import provenance
+class ScatterCounts(Settings):
+    """`resolutions` are voxels along the longest side; `rays` for each geometry and kind of points; `strands` of a
+    geometry, its own number if left out; `speed_rays` are timed."""
 
-    start, rays = time.perf_counter(), 60 if quick else 1000
-    rows, speed = [], []
-    for name in GEOMETRIES[:2] if quick else GEOMETRIES:
-        strands = _strands(name, quick)
-        places = {"fibres": on_fibres(strands, rays), "seen": seen(strands, name, rays)}
-        exact = {}
-        for where, (origin, direction, own, _) in places.items():
-            exact[where] = exact_crossings(strands, origin, direction, own).to(torch.float64)
-        for resolution in (8, 24) if quick else RESOLUTIONS:
-            began = time.perf_counter()
+    geometries: list[str] = ["block", "double_block", "wavy_bundle", "ball"]
+    resolutions: list[int] = [8, 12, 16, 24, 32, 48, 64, 96]
+    rays: int = 1000
+    strands: int | None = None
+    speed_rays: int = 20_000
+
+
+def compute(settings: ScatterCounts, work: Work) -> Data:
+    """Counts and times; arrays are `[geometry, resolution, kind of points, ...]`, those of times without points."""
+    rows: list[dict[str, Any]] = []
+    speed: list[dict[str, Any]] = []
+    for k, name in enumerate(settings.geometries):
+        if name not in GENERATORS:
+            raise InputError(f"geometries.{k}", name, ", ".join(GENERATORS))
+        strands = _strands(name, settings.strands)
+        places = (on_fibres(strands, settings.rays), seen(strands, name, settings.rays))
+        exact = [exact_crossings(strands, *place[:3]).to(torch.float64) for place in places]
+        for resolution in settings.resolutions:
+            began = time.process_time()
             grid = DensityGrid.of(strands, resolution, max_n=1e6)
-            built = time.perf_counter() - began
-            for where, given in places.items():
-                common = {"geometry": name, "points": where, "resolution": resolution, "voxel": grid.voxel}
-                rows.append(common | measured(grid, given, exact[where]))
-            speed.append(
-                {"geometry": name, "resolution": resolution, "seconds": built}
-                | timed(grid, places["fibres"], 500 if quick else 20_000)
-            )
-    data = {
-        "provenance": provenance(),
-        "quick": quick,
-        "rays": rays,
-        "seconds": time.perf_counter() - start,
-        "rows": rows,
-        "speed": speed,
+            built = time.process_time() - began
+            rows += [measured(grid, place, counted) for place, counted in zip(places, exact, strict=True)]
+            speed.append({"speed.seconds": built, **timed(grid, places[0], settings.speed_rays)})
+            work.say(f"{name}, {resolution} voxels")
+    shape = (len(settings.geometries), len(settings.resolutions))
+    arrays = _stacked(rows, (*shape, len(POINTS))) | _stacked(speed, shape)
+    backend = str(arrays.pop("speed.backend").flat[0])
+    record = {
+        "geometries": settings.geometries,
+        "resolutions": settings.resolutions,
+        "points": POINTS,
+        "rays": settings.rays,
+        "others": list(OTHERS),
+        "steps": STEPS,
+        "speed_kinds": list(_kinds()),
+        "speed_backend": backend,
     }
-    write_json(folder / NAME, data)
-    return data
+    return Data(arrays, record)
 
 
-def _strands(name: str, quick: bool) -> Strands:
-    count: Any = (60, 300) if name == "double_block" else 200
-    return GENERATORS[name](seed=1, **({"strands": count} if quick else {}))
+def _stacked(rows: list[dict[str, Any]], shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """Values of all rows, by name."""
+    whole = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    return {name: value.reshape(*shape, *value.shape[1:]) for name, value in whole.items()}
+
+
+def _strands(name: str, strands: int | None) -> Strands:
+    """The geometry; of the double block `strands` is a mean of its two layers, which differ by a factor of five."""
+    if strands is None:
+        return GENERATORS[name](seed=1)
+    count: Any = (round(strands / 3), round(5 * strands / 3)) if name == "double_block" else strands
+    return GENERATORS[name](seed=1, strands=count)
 
 
 def on_fibres(strands: Strands, rays: int, seed: int = 1) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -107,19 +120,17 @@ def _directions(rays: int, generator: torch.Generator) -> Tensor:
 def measured(grid: DensityGrid, given: tuple[Tensor, ...], exact: Tensor) -> dict[str, Any]:
     """The grid's n against N; and what other ways to treat the own fibre, the sine and the step would do."""
     origin, direction, _, radius = given
-    n = grid.crossings(origin, direction, radius)
-    others = {
-        "from the point itself": grid.crossings(origin, direction),
-        "half a voxel on": grid.crossings(origin + 0.5 * grid.voxel * direction, direction),
-        "root of the mean square sine": rooted(grid)(origin, direction, radius),
-    }
+    found: dict[str, Any] = with_errors(compare, grid.crossings(origin, direction, radius), exact)
+    found |= {f"bins.{name}": v for name, v in bins(grid.crossings(origin, direction, radius), exact).items()}
+    others = [with_errors(brief, treat(grid, origin, direction, radius), exact) for treat in OTHERS.values()]
+    found |= {f"others.{name}": [other[name] for other in others] for name in others[0]}
     fine = stepped(grid, _FINEST).crossings(origin, direction)
-    steps = {f"{step:g}": stepped(grid, step).crossings(origin, direction) - fine for step in STEPS}
-    few = n <= 1
-    return compare(n, exact, few) | {
-        "others": {name: compare(other, exact, few, bins=False) for name, other in others.items()},
-        "steps": {name: float(error.square().mean().sqrt()) for name, error in steps.items()},
-    }
+    steps = [with_errors(_rms, stepped(grid, step).crossings(origin, direction) - fine) for step in STEPS]
+    return found | {f"steps.{name}": [step[name] for step in steps] for name in steps[0]}
+
+
+def _rms(error: Tensor) -> dict[str, float]:
+    return {"rms": float(error.square().mean().sqrt())}
 
 
 def stepped(grid: DensityGrid, step: float, mode: str = "auto") -> DensityGrid:
@@ -146,45 +157,63 @@ def rooted(grid: DensityGrid) -> Callable[..., Tensor]:
     return crossings
 
 
+OTHERS: dict[str, Callable[[DensityGrid, Tensor, Tensor, Tensor], Tensor]] = {
+    "from the point itself": lambda grid, origin, direction, radius: grid.crossings(origin, direction),
+    "half a voxel on": lambda grid, origin, direction, radius: grid.crossings(
+        origin + 0.5 * grid.voxel * direction, direction
+    ),
+    "root of the mean square sine": lambda grid, origin, direction, radius: rooted(grid)(origin, direction, radius),
+}
+"""Other treatments of the start, which keep the own fibre, and of the sine."""
+
+
+def _kinds() -> dict[str, tuple[str, float]]:
+    return {f"{mode}, step {step:g}": (mode, step) for mode in ("auto", "eager") for step in STEPS[:2]}
+
+
 def timed(grid: DensityGrid, given: tuple[Tensor, ...], rays: int, rounds: int = 9) -> dict[str, Any]:
     """Nanoseconds of processor time a ray, the least of rounds in turn, in float32 and one thread; and bytes."""
     torch.set_num_threads(1)
     index = torch.arange(rays) % len(given[0])
     origin = given[0][index].to(torch.float32)
     direction = _directions(rays, torch.Generator().manual_seed(3)).to(torch.float32)
-    grids = {f"{mode}, step {step:g}": stepped(grid, step, mode) for mode in ("auto", "eager") for step in STEPS[:2]}
+    grids = {name: stepped(grid, step, mode) for name, (mode, step) in _kinds().items()}
     least = dict.fromkeys(grids, float("inf"))
     for turn in range(rounds):
         for name, other in grids.items():
             if turn > 2 and "eager" in name:
                 continue
-            count = rays // 10 if "eager" in name else rays
+            count = max(1, rays // 10) if "eager" in name else rays
             began = time.process_time()
             other.crossings(origin[:count], direction[:count])
             least[name] = min(least[name], (time.process_time() - began) / count * 1e9)
-    _ = grid.backend
-    return {"backend": grid.backend, "nanoseconds": least, "memory": grid.memory, "voxels": list(grid.shape)}
+    return {
+        "speed.backend": grid.backend,
+        "speed.nanoseconds": list(least.values()),
+        "speed.memory": grid.memory,
+        "voxels": list(grid.shape),
+    }
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Command line; see the module text."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, help="measure, and write data, figure and table to this folder")
-    parser.add_argument("--plot", type=Path, help="figure and table of the data in this folder")
-    parser.add_argument("--quick", action="store_true", help="few strands, few rays, two grids")
-    given = parser.parse_args(arguments)
-    folder = given.out or given.plot
-    if folder is None:
-        parser.error("--out or --plot is needed")
-    if given.out is not None:
-        compute(folder, given.quick)
-    from _scatter_counts_report import figure, table
-
-    data = json.loads((folder / NAME).read_text())
-    (folder / "scatter_counts.md").write_text(table(data))
-    figure(data, folder)
-    print((folder / "scatter_counts.md").read_text())
-
-
-if __name__ == "__main__":
-    main()
+EXPERIMENT = Experiment(
+    title="Scatter counts of the voxel grid",
+    shows="Numbers of crossed fibres that the grid expects against exact counts: bias, scatter, shares of rays that "
+    "cross none, and the two rules for the lit share v.",
+    settings=ScatterCounts,
+    compute=compute,
+    minutes=5,
+    reproduces={
+        **{
+            name: Exact()
+            for name in ("geometries", "resolutions", "points", "rays", "others", "steps", "voxels", "speed_kinds")
+        },
+        "speed*": Measured(),
+        "*_error": Measured(),  # of what the errors belong to, the estimates tell
+        "bins.rays": Measured(),  # random numbers of rays
+        "bins.*": Estimate(error="bins.*_error", most=math.inf),
+        "others.*": Estimate(error="others.*_error", most=math.inf),
+        "steps.*": Estimate(error="steps.*_error", most=math.inf),
+        "*": Estimate(error="*_error", most=math.inf),
+    },
+    small=('geometries=["block", "double_block"]', "resolutions=[8, 24]", "rays=60", "strands=200", "speed_rays=500"),
+)
