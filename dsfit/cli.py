@@ -1,6 +1,6 @@
 """The command line: `dsfit run CONFIG`, `dsfit check CONFIG`, `dsfit bench CONFIG`, `dsfit render CONFIG`,
 `dsfit compare-images A.exr REF.exr`, `dsfit plan CONFIG`, `dsfit export CONFIG`, `dsfit show RUNDIR`, `dsfit presets`,
-`dsfit figures list|run|draw`.
+`dsfit figures list|run|draw`, `dsfit sweep CONFIG`.
 
 Exit codes: 0 done, 1 the run failed (what is done is kept), 2 the config or an argument is wrong (nothing was
 written), 3 a check was not passed, 130 interrupted.
@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 
 from dsfit.figures.command import app as figures
+from dsfit.sweep.command import register as register_sweep
 
 if TYPE_CHECKING:
     from dsfit.experiment.rundir import RunDirectory
@@ -27,6 +28,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(figures, name="figures")
+register_sweep(app)
 
 
 @app.callback()
@@ -47,9 +49,7 @@ Workers = Annotated[
 
 
 @app.command()
-def run(
-    config: Config, set_: Changes = None, out: Out = None, force: Force = False, workers: Workers = None
-) -> None:
+def run(config: Config, set_: Changes = None, out: Out = None, force: Force = False, workers: Workers = None) -> None:
     """Run an experiment: compute, tabulate, plot. A finished run is shown again, an interrupted one goes on where it
     stopped."""
     _run(config, set_ or [], out, force, workers)
@@ -77,9 +77,7 @@ def check(
 
 
 @app.command()
-def bench(
-    config: Config, set_: Changes = None, out: Out = None, force: Force = False, workers: Workers = None
-) -> None:
+def bench(config: Config, set_: Changes = None, out: Out = None, force: Force = False, workers: Workers = None) -> None:
     """Race peers: error against run time over a stream of contexts and at single ones, as the config's [race] says.
     Exits with 3 if a peer's estimates are off the truth."""
     from dsfit.experiment.race import failed

@@ -27,8 +27,10 @@ BEYOND_DEG = (0.0, 60.0, 89.9, -89.9)
 BEYOND_N = (0.0, 100.0, 300.0, 1e4)
 
 
-def amortise(job: Job, directory: RunDirectory, say: Callable[[str], None]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Numbers and arrays of one cell; the proposal is saved on the way."""
+def amortise(
+    job: Job, directory: RunDirectory | None, say: Callable[[str], None]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Numbers and arrays of one cell; the proposal is saved on the way, if there is a directory."""
     from dsfit.fit.amortise import amortise as train
     from dsfit.fit.amortise import held_out
     from dsfit.proposals import AmortisedProposal
@@ -42,8 +44,11 @@ def amortise(job: Job, directory: RunDirectory, say: Callable[[str], None]) -> t
         hidden=tuple(options.hidden), defensive=options.defensive, inclinations=options.inclinations,
         pairs=options.pairs, scale=options.scale,
     )  # fmt: skip
-    path = directory.proposal_path(job.index, NAME)
-    save_proposal(path, found.proposal)
+    kept: dict[str, Any] = {}
+    if directory is not None:
+        path = directory.proposal_path(job.index, NAME)
+        save_proposal(path, found.proposal)
+        kept["file"] = path.relative_to(directory.path).as_posix()
     integrand = Integrand(bsdf)
     say("unseen contexts")
     unseen = held_out(integrand, found.proposal, check=options.check)
@@ -53,7 +58,7 @@ def amortise(job: Job, directory: RunDirectory, say: Callable[[str], None]) -> t
     say("beyond")
     beyond = held_out(integrand, found.proposal, beyond_contexts(), check=0)
     data = {
-        "file": path.relative_to(directory.path).as_posix(),
+        **kept,
         "training": {
             "seconds": found.seconds,
             "steps": found.steps,

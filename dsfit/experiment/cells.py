@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
+from dsfit.errors import InputError
 from dsfit.experiment import build
 from dsfit.experiment.rundir import RunDirectory
 from dsfit.experiment.schema import Config
@@ -36,18 +37,18 @@ def jobs(experiment: Experiment) -> list[Job]:
     """All cells, in a fixed order."""
     found: list[Job] = []
     for number, point in enumerate(experiment.points):
-        for work in _work_of(point.config, first=number == 0):
+        for work in work_of(point.config, first=number == 0):
             identity = {"grid": point.values, **work}
-            found.append(Job(len(found), _label(point.config, identity), identity, point.config))
+            found.append(Job(len(found), label_of(point.config, identity), identity, point.config))
     return found
 
 
-def _work_of(config: Config, first: bool) -> Iterable[dict[str, Any]]:
+def work_of(config: Config, first: bool) -> Iterable[dict[str, Any]]:
     """Identities of the cells of one grid point; `first` says whether it is the first one."""
     if config.kind == "check":
-        from dsfit.experiment.checking import work_of
+        from dsfit.experiment.checking import work_of as suites_of
 
-        return work_of(config, first=first)
+        return suites_of(config, first=first)
     if config.kind == "race":
         from dsfit.experiment.race import work_of as races_of
 
@@ -68,7 +69,8 @@ def _work_of(config: Config, first: bool) -> Iterable[dict[str, Any]]:
 _SHOWN_ANYWAY = ("fiber.preset", "contexts.theta_r_deg", "contexts.phi_r_deg", "contexts.n", "contexts.v")
 
 
-def _label(config: Config, identity: dict[str, Any]) -> str:
+def label_of(config: Config, identity: dict[str, Any]) -> str:
+    """A cell's name for tables and plots."""
     if identity.get("part"):
         return f"{identity['suite']}: {identity['part']}"
     if identity.get("peer"):
@@ -79,7 +81,7 @@ def _label(config: Config, identity: dict[str, Any]) -> str:
         top, left, bottom, right = identity["tile"]
         return f"rows {top} to {bottom - 1}, columns {left} to {right - 1}"
     parts = [config.fiber.preset]
-    parts += [f"{key.split('.')[-1]} {value}" for key, value in identity["grid"].items() if key not in _SHOWN_ANYWAY]
+    parts += [f"{_last(key)} {value}" for key, value in identity["grid"].items() if not key.startswith(_SHOWN_ANYWAY)]
     context = identity["context"]
     if context:
         parts.append(f"θr {context['theta_r_deg']:g}°")
@@ -92,36 +94,62 @@ def _label(config: Config, identity: dict[str, Any]) -> str:
     return ", ".join(parts)
 
 
+def _last(key: str) -> str:
+    """The last part of a dotted key; of a list's element, the list's name too."""
+    name, _, last = key.rpartition(".")
+    return f"{name.rpartition('.')[2]}.{last}" if last.isdigit() else last
+
+
 def run_job(directory: RunDirectory, job: Job, say: Callable[[str], None]) -> None:
     """Compute a cell and write it."""
+    data, arrays = compute_job(directory, job, say)
+    directory.write_cell(job.index, data, arrays)
+
+
+def compute_job(
+    directory: RunDirectory | None, job: Job, say: Callable[[str], None]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Numbers and arrays of a cell, not yet written.
+
+    Without a directory nothing is written on the way either: proposals are not kept and no maps are made. That is for
+    comparisons, transmittances, checks and amortising; the other kinds share files between their cells.
+    """
     started = time.perf_counter()
-    if job.config.kind == "transmittance":
+    data, arrays = _computed(directory, job, say)
+    data = {"index": job.index, "label": job.label, "identity": job.identity, **data}
+    return {**data, "seconds": time.perf_counter() - started}, arrays
+
+
+def _computed(
+    directory: RunDirectory | None, job: Job, say: Callable[[str], None]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    kind = job.config.kind
+    if kind == "transmittance":
         from dsfit.experiment.transmittance import transmittance
 
-        data, arrays = transmittance(job.config, say)
-    elif job.config.kind == "check":
+        return transmittance(job.config, say)
+    if kind == "check":
         from dsfit.experiment.checking import run_suite
 
-        data, arrays = run_suite(job.config, job.identity, job.label, say)
-    elif job.config.kind == "race":
-        from dsfit.experiment.race import race
-
-        data, arrays = race(job.config, job.identity, directory, say)
-    elif job.config.kind == "compare_render":
-        from dsfit.experiment.compare_render import compare_render
-
-        data, arrays = compare_render(job.config, job.identity, directory, say)
-    elif job.config.kind == "render":
-        from dsfit.experiment.render import render
-
-        data, arrays = render(job.config, job.identity, directory, say)
-    elif job.config.kind == "amortise":
+        return run_suite(job.config, job.identity, job.label, say)
+    if kind == "amortise":
         from dsfit.experiment.amortise import amortise
 
-        data, arrays = amortise(job, directory, say)
-    else:
+        return amortise(job, directory, say)
+    if kind in ("compare", "sweep"):
         from dsfit.experiment.compare import compare
 
-        data, arrays = compare(job, directory, say)
-    data = {"index": job.index, "label": job.label, "identity": job.identity, **data}
-    directory.write_cell(job.index, {**data, "seconds": time.perf_counter() - started}, arrays)
+        return compare(job, directory, say)
+    if directory is None:
+        raise InputError("directory", None, f"a run directory for cells of kind {kind!r}")
+    if kind == "race":
+        from dsfit.experiment.race import race
+
+        return race(job.config, job.identity, directory, say)
+    if kind == "compare_render":
+        from dsfit.experiment.compare_render import compare_render
+
+        return compare_render(job.config, job.identity, directory, say)
+    from dsfit.experiment.render import render
+
+    return render(job.config, job.identity, directory, say)

@@ -29,9 +29,10 @@ TARGET = 0.01
 
 
 def compare(
-    job: Job, directory: RunDirectory, say: Callable[[str], None]
+    job: Job, directory: RunDirectory | None, say: Callable[[str], None]
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Numbers and arrays of one cell. Fitted proposals are saved on the way."""
+    """Numbers and arrays of one cell. Fitted proposals are saved on the way; without a directory they are not, and
+    there are no arrays."""
     from dsfit.quality import reference as integrate
 
     config, context = job.config, build.context(job.config, job.identity["context"])
@@ -45,10 +46,6 @@ def compare(
     truth = reference if planned.bound == 0 else integrate(planned.whole, context, rtol=config.estimate.rtol)
     reference_seconds = time.perf_counter() - clock
     setting = Setting(config, integrand, context)
-    grid, arrays = _map_grid(context)
-    norm = float(reference.norm)
-    with torch.no_grad():
-        arrays["integrand"] = _image(torch.linalg.vector_norm(integrand(grid, context), dim=-1) / norm)
     plans = []
     for method in config.methods:
         say(method.name)
@@ -58,16 +55,14 @@ def compare(
     quality = judge(plans, setting, reference)
     judge_seconds = time.perf_counter() - clock
     found = []
-    for k, (method, plan, numbers) in enumerate(zip(config.methods, plans, quality, strict=True)):
-        if plan.fitted:
+    for method, plan, numbers in zip(config.methods, plans, quality, strict=True):
+        if plan.fitted and directory is not None:
             path = directory.proposal_path(job.index, method.name)
             save_proposal(path, plan.strategies[0])
             plan.fit["file"] = path.relative_to(directory.path).as_posix()
         say(f"{method.name}: estimates")
         generator = torch.Generator().manual_seed(_seed(config.estimate.seed, job.identity, method.name))
         curve = _estimates(plan, integrand, context, config.estimate, truth, numbers["variance"], generator)
-        with torch.no_grad():
-            arrays[f"density_{k}"] = _image(plan.density(grid, context))
         found.append({"name": method.name, "kind": method.kind, **plan.description(), **numbers, **curve})
     data = {
         "context": {name: getattr(context, name).item() for name in ("theta_r", "phi_r", "n", "v")},
@@ -84,7 +79,7 @@ def compare(
         "judge_seconds": judge_seconds,
         "methods": found,
     }
-    return data, arrays
+    return data, {} if directory is None else _maps(integrand, plans, context, float(reference.norm))
 
 
 def _seed(seed: int, identity: dict[str, Any], name: str) -> int:
@@ -200,6 +195,16 @@ def _map_grid(context: Context) -> tuple[Tensor, dict[str, np.ndarray]]:
     t, p = torch.meshgrid(theta, phi, indexing="ij")
     degrees = {"theta_deg": np.linspace(-90, 90, MAP_STEPS[0]), "phi_deg": np.linspace(-180, 180, MAP_STEPS[1])}
     return torch.stack([t, context.phi_r - p], dim=-1), degrees
+
+
+def _maps(integrand: Any, plans: list[Plan], context: Context, norm: float) -> dict[str, np.ndarray]:
+    """The integrand over its norm, and every plan's density, on a grid of directions."""
+    grid, arrays = _map_grid(context)
+    with torch.no_grad():
+        arrays["integrand"] = _image(torch.linalg.vector_norm(integrand(grid, context), dim=-1) / norm)
+        for k, plan in enumerate(plans):
+            arrays[f"density_{k}"] = _image(plan.density(grid, context))
+    return arrays
 
 
 def _image(values: Tensor) -> np.ndarray:

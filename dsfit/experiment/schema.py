@@ -192,9 +192,17 @@ class OutputConfig(Section):
 
 
 class SweepConfig(Section):
-    """`[sweep.grid]`: dotted keys, each with the list of values it takes; all combinations are run."""
+    """`[sweep]`: what is varied. `[sweep.grid]`: dotted keys, each with the list of values it takes; all combinations
+    are run. `[sweep.space]`: dotted keys, each with a range `{ low, high, scale = "linear" | "log", integer }` or
+    `{ choices = [...] }`, sampled at `points` points by the design "random" or "sobol" with its `seed`; each grid point
+    with each of them.
+    """
 
+    design: Literal["grid", "random", "sobol"] = "grid"
+    points: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
     grid: dict[str, Any] = {}
+    space: dict[str, Any] = {}
 
 
 class TransmittanceConfig(Section):

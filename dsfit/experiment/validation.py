@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 import types
@@ -15,7 +14,8 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from dsfit.errors import InputError
-from dsfit.experiment.reader import ConfigError, RawConfig, did_you_mean, dotted, read, set_value
+from dsfit.experiment.design import all_values, at_point, design_of
+from dsfit.experiment.reader import ConfigError, RawConfig, did_you_mean, dotted, read
 from dsfit.experiment.rundir import slug
 from dsfit.experiment.schema import Config
 
@@ -24,8 +24,7 @@ MAX_CELLS = 100_000
 
 @dataclass(frozen=True)
 class GridPoint:
-    """One combination of the values of `[sweep.grid]`, with the config that results; `values` is empty without a
-    sweep."""
+    """One point of the design of `[sweep]`, with the config that results; `values` is empty without a sweep."""
 
     values: dict[str, Any]
     config: Config
@@ -54,10 +53,15 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Experiment:
     Raises:
         ConfigError: the first thing that is wrong; further ones are listed below it in the message.
     """
+    raw, config = load_base(path, overrides)
+    return Experiment(raw.name, raw, config, expand(raw, config))
+
+
+def load_base(path: str | Path, overrides: Sequence[str] = ()) -> tuple[RawConfig, Config]:
+    """The tables and the config of a file, as `load` reads them, without the points of its sweep."""
     raw = read(path, overrides)
     _anchor_paths(raw)
-    config = validate(raw)
-    return Experiment(raw.name, raw, config, expand(raw, config))
+    return raw, validate(raw)
 
 
 def _anchor_paths(raw: RawConfig) -> None:
@@ -101,48 +105,20 @@ def validate(raw: RawConfig) -> Config:
 
 
 def expand(raw: RawConfig, config: Config) -> list[GridPoint]:
-    """All grid points, each validated on its own."""
-    axes = _flatten(config.sweep.grid)
-    for key, values in axes.items():
-        where = ("sweep", "grid", key)
-        if not isinstance(values, list) or not values:
-            raise raw.error(where, f"a list of values for {key}", values)
-        if key.split(".")[0] in ("sweep", "output", "kind", "title"):
-            raise raw.error(
-                where, "keys of what is computed (fiber, bsdf, light, scattering, contexts, methods, estimate)", key
-            )
-    size = 1
-    for values in axes.values():
-        size *= len(values)
-    if size > MAX_CELLS:
-        raise raw.error(("sweep", "grid"), f"at most {MAX_CELLS} combinations (these are {size})")
-    points = []
-    for combination in itertools.product(*axes.values()):
-        values = dict(zip(axes, combination, strict=True))
-        changed = raw.copy()
-        for key, value in values.items():
-            source = f"{raw.source(('sweep', 'grid', key))} (sweep.grid)"
-            set_value(changed, key.split("."), value, source)
-        points.append(GridPoint(values, validate(changed) if values else config))
-    return points
-
-
-def _flatten(grid: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Dotted keys may be quoted (`"fiber.eta" = [...]`) or plain (`fiber.eta = [...]`), which TOML reads as nested
-    tables."""
-    flat: dict[str, Any] = {}
-    for key, value in grid.items():
-        if isinstance(value, dict):
-            flat.update(_flatten(value, f"{prefix}{key}."))
-        else:
-            flat[prefix + key] = value
-    return flat
+    """All points of the design, each validated on its own."""
+    design = design_of(raw, config.sweep)
+    if len(design) > MAX_CELLS:
+        raise raw.error(("sweep", "grid"), f"at most {MAX_CELLS} combinations (these are {len(design)})")
+    return [
+        GridPoint(values, validate(at_point(raw, design.sources, values)) if values else config)
+        for values in all_values(design)
+    ]
 
 
 def _cross_check(raw: RawConfig, config: Config) -> None:
     if config.kind in ("compare", "sweep") and not config.methods:
         raise raw.error(("methods",), "at least one [[methods]] table", [])
-    if config.kind == "sweep" and not config.sweep.grid:
+    if config.kind == "sweep" and not (config.sweep.grid or config.sweep.space):
         raise raw.error(("sweep", "grid"), "at least one dotted key with a list of values, as kind is 'sweep'", {})
     seen: set[str] = set()
     for index, method in enumerate(config.methods):

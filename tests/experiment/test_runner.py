@@ -153,7 +153,7 @@ def test_the_run_id_follows_what_decides_the_numbers(tiny: Path, monkeypatch: py
     base = identity()
     assert identity("title=other") == identity("output.dir=elsewhere") == identity("fiber.preset=blond") == base
     assert identity("fiber.eta=1.5") != base != identity("estimate.seed=2")
-    monkeypatch.setattr(provenance, "code_version", lambda: "9")
+    monkeypatch.setattr(provenance, "numbers_version", lambda: "9")
     assert identity() != base
 
 
