@@ -1,6 +1,6 @@
 """The command line: `dsfit run CONFIG`, `dsfit check CONFIG`, `dsfit bench CONFIG`, `dsfit render CONFIG`,
 `dsfit compare-images A.exr REF.exr`, `dsfit plan CONFIG`, `dsfit export CONFIG`, `dsfit show RUNDIR`, `dsfit presets`,
-`dsfit figures list|run|draw`, `dsfit sweep CONFIG`.
+`dsfit figures list|run|draw`, `dsfit sweep CONFIG`, `dsfit report DIR`.
 
 Exit codes: 0 done, 1 the run failed (what is done is kept), 2 the config or an argument is wrong (nothing was
 written), 3 a check was not passed, 130 interrupted.
@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 
 from dsfit.figures.command import app as figures
+from dsfit.report.command import report
 from dsfit.sweep.command import register as register_sweep
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(figures, name="figures")
+app.command()(report)
 register_sweep(app)
 
 
@@ -236,6 +238,7 @@ def _console() -> Console:
 
 def _report(directory: RunDirectory, result: dict[str, Any], draw: bool) -> None:
     from dsfit.experiment import files, summary
+    from dsfit.report import write_report
 
     console = _console()
     console.print(summary.terminal_table(result))
@@ -245,6 +248,7 @@ def _report(directory: RunDirectory, result: dict[str, Any], draw: bool) -> None
         from dsfit.experiment import plots
 
         plots.draw_all(directory, result)
+        write_report(directory.path)
     console.print(f"results:   {directory.path / 'result.json'}", soft_wrap=True)
     if (image := directory.path / "image.exr").is_file():
         console.print(f"image:     {image}, image.png", soft_wrap=True)
@@ -252,6 +256,8 @@ def _report(directory: RunDirectory, result: dict[str, Any], draw: bool) -> None
         console.print(f"proposals: {fitted} (dsfit.load_proposal)", soft_wrap=True)
     if figures.is_dir():
         console.print(f"figures:   {figures}", soft_wrap=True)
+    if draw:
+        console.print(f"report:    {directory.path / 'report.html'}", soft_wrap=True)
 
 
 def _fail(message: str, code: int) -> NoReturn:

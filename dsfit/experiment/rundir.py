@@ -9,6 +9,7 @@ result.json        everything in one file; written last, so it marks the run as 
 image.exr  image.png      of a rendering
 table.md  figures/*.png  figures/*.pdf
 images/*.exr  images/*.png   what was rendered
+report.html        all of it on one page
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from dsfit.experiment.schema import SCHEMA_VERSION
 
 _OWN = (
     "config.toml", "provenance.json", "result.json", "table.md", "image.exr", "image.png", "cells", "proposals",
-    "figures", "images",
+    "figures", "images", "report.html",
 )  # fmt: skip
 
 

@@ -96,7 +96,10 @@ _FIGURES: dict[str, Caption] = {
         "Energy that comes back under constant light: quadrature and estimates for each channel above, all proposals' "
         "estimates over quadrature below.",
     ),
-    "rings": ("Ring light", "Light from narrow rings: estimates of every proposal over quadrature."),
+    "rings": ("Ring light", 
+        "Samples over what quadrature expects in narrow rings of incident light: above the right samplers, below "
+        "planted wrong ones, which must stand out.",
+    ),
     "gradients": (
         "Gradients of the variance",
         "Gradients with respect to every parameter of each proposal, with one standard error, by estimator; on the "

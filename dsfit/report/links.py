@@ -25,6 +25,8 @@ _WHAT = {
     "drawn.json": "hashes of figures and tables",
     "manifest.json": "every file with its hash",
     "verify.json": "comparison with stored data",
+    "failed.json": "why the last attempt came to nothing",
+    "thesis.tex": "a document with every figure and table",
     "log.txt": "what the last attempt said",
     "image.exr": "radiance, variance, counts and times, float32",
 }

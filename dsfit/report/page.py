@@ -57,7 +57,7 @@ class Picture:
         name: short, for people.
         caption: what one sees.
         alt: for those who do not see it.
-        width, height: of what is embedded, in pixels.
+        width, height: to show it at, in CSS pixels.
         full: the file itself, and `others` the same in other formats.
         note: how what is embedded differs from the file.
     """

@@ -18,6 +18,7 @@ BUDGET = 10_500_000
 """Bytes of all pictures of a page together; as base64 they take a third more."""
 MOST, LEAST = 900_000, 30_000
 """Bytes of one picture: no more than this even where it is the only one, and what it may always have."""
+_ENLARGED, _SCREEN = 1.2, 96.0
 _MOST_PIXELS = 80_000_000
 _WIDTHS = (2400, 1800, 1400, 1000, 700)
 _LONGEST = 16_000  # WebP ends at 16383 pixels
@@ -52,7 +53,9 @@ def _alt(name: str, caption: str) -> str:
 
 
 def embed(path: Path, limit: int) -> tuple[str, int, int, str]:
-    """Data URI, width, height, and how it differs from the file (empty: the same pixels).
+    """Data URI, width and height to show it at, and how it differs from the file (empty: the same pixels).
+
+    Figures tell their resolution: they are shown a fifth larger than in print, whatever their pixels.
 
     Raises:
         OSError: there is no such picture, it is damaged, or too large to open.
@@ -67,13 +70,22 @@ def embed(path: Path, limit: int) -> tuple[str, int, int, str]:
                 if image.width * image.height > _MOST_PIXELS:
                     raise OSError(f"too large for a page: {image.width} x {image.height} pixels")
                 image.load()
+                width, height = _shown(image)
                 if len(content) <= limit:
-                    return _uri("png", content), image.width, image.height, ""
-                return _smaller(_on_white(image), limit, len(content))
+                    return _uri("png", content), width, height, ""
+                source, note = _smaller(_on_white(image), limit, len(content))
+                return source, width, height, note
     except OSError:
         raise
     except Exception as error:  # damaged files make zlib, struct and Pillow complain each in its own way
         raise OSError(f"damaged picture ({type(error).__name__}: {error})"[:200]) from None
+
+
+def _shown(image: Image) -> tuple[int, int]:
+    """Width and height in CSS pixels, 96 to an inch."""
+    density = image.info.get("dpi", (0, 0))[0]
+    scale = _ENLARGED * _SCREEN / density if 50 <= density <= 1200 else 1.0
+    return max(1, round(image.width * scale)), max(1, round(image.height * scale))
 
 
 def _on_white(image: Image) -> Image:
@@ -87,24 +99,23 @@ def _on_white(image: Image) -> Image:
     return paper.convert("RGB")
 
 
-def _smaller(image: Image, limit: int, before: int) -> tuple[str, int, int, str]:
+def _smaller(image: Image, limit: int, before: int) -> tuple[str, str]:
     """WebP without loss if that is small enough, else with loss, and at last narrower."""
-    packed, shown = b"", image
+    packed = b""
     if max(image.size) <= _LONGEST:
         packed = _webp(image, lossless=True)
         if len(packed) <= limit:
-            return _uri("webp", packed), image.width, image.height, ""
+            return _uri("webp", packed), ""
     for width in (image.width, *(w for w in _WIDTHS if w < image.width)):
         height = max(1, round(image.height * width / image.width))
         if max(width, height) > _LONGEST:
             continue
-        shown = image if width == image.width else image.resize((width, height))
-        packed = _webp(shown, lossless=False)
+        packed = _webp(image if width == image.width else image.resize((width, height)), lossless=False)
         if len(packed) <= limit:
             break
     if not packed:
         raise OSError(f"too long for a page: {image.width} x {image.height} pixels")
-    return _uri("webp", packed), shown.width, shown.height, f"compressed for this page; the file has {size(before)}"
+    return _uri("webp", packed), f"compressed for this page; the file has {size(before)}"
 
 
 def _webp(image: Image, lossless: bool) -> bytes:

@@ -43,9 +43,9 @@ def run_page(folder: Path, place: Place) -> Page:
     verdict = _unfinished(folder, problem) if problem else _guarded(lambda: _verdict(result), _damaged)
     title = str(result.get("title") or result.get("name") or folder.absolute().name)
     sections = [
-        Section("asked", "What was asked", _asked(folder, place)),
         Section("result", "What came out", [verdict, *_tables(result), *_by_context(result)]),
         Section("figures", "Figures", _figures(folder, result, place)),
+        Section("asked", "What was asked", _asked(folder, place)),
         Section("environment", "Environment", _environment(provenance, result)),
         Section("files", "Files", _files(folder, place), printed=False),
     ]

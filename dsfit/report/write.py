@@ -56,7 +56,7 @@ def make_page(folder: Path, place: Place, root: Path) -> Page:
         there = {path.name for path in folder.iterdir()}
     except (OSError, ValueError) as error:
         raise InputError(str(folder), getattr(error, "strerror", None) or str(error), allowed) from None
-    if "manifest.json" in there or any(folder.glob("*/computed.json")) or any(folder.glob("*/log.txt")):
+    if "manifest.json" in there or any(any(folder.glob(f"*/{n}.json")) for n in ("computed", "failed")):
         from dsfit.report.figures import figures_page
 
         return figures_page(folder, place, root)
