@@ -106,12 +106,14 @@ def _experiment(one: Standing, checked: Verification, album: Album, place: Place
         blocks.append(one.verdict)
     if shows:
         blocks.append(Text([shows]))
+    blocks.append(Code(_command(one), f"command of {one.name}"))
     if one.log:
         blocks.append(Fold("The end of log.txt", [Code(one.log, f"log of {one.name}", wrap=True)], open=True))
     for path in _pictures(one):
-        blocks.append(album.picture(path, _caption(one, path.stem), _words(path.stem)))
+        caption = _caption(one, path.stem)
+        blocks.append(album.picture(path, "" if caption == shows else caption, _words(path.stem), alt=caption))
     blocks += _tables(one, place)
-    blocks += [Code(_command(one), f"command of {one.name}"), *checked.blocks(one.name)]
+    blocks += checked.blocks(one.name)
     if facts := _times(one):
         blocks.append(Facts(facts))
     return [*blocks, *_folds(one, place)]

@@ -14,7 +14,7 @@ MOST_FILES = 400
 """Files that a list shows."""
 
 _WHAT = {
-    "config.toml": "the config, resolved; `dsfit run` takes it",
+    "config.toml": "the config, resolved",
     "settings.toml": "the settings",
     "provenance.json": "versions, machine, seed, sessions",
     "result.json": "every number",
@@ -27,6 +27,9 @@ _WHAT = {
     "verify.json": "comparison with stored data",
     "failed.json": "why the last attempt came to nothing",
     "thesis.tex": "a document with every figure and table",
+    "sweep.json": "design, counts, seconds, versions, machines",
+    "results.parquet": "all rows",
+    "cells.log": "what every finished cell left",
     "log.txt": "what the last attempt said",
     "image.exr": "radiance, variance, counts and times, float32",
 }

@@ -33,8 +33,9 @@ class Album:
         self._place = place
         self._limit = min(max(BUDGET // max(count, 1), LEAST), MOST)
 
-    def picture(self, path: Path, caption: str, name: str = "") -> Picture:
-        """The picture in the file, or a note in its place."""
+    def picture(self, path: Path, caption: str, name: str = "", alt: str = "") -> Picture:
+        """The picture in the file, or a note in its place; `alt` is told to those who do not see it, instead of the
+        caption."""
         name = name or path.stem
         beside = [path.with_suffix(suffix) for suffix in _FORMATS]
         others = [self._place.link(p, _FORMATS[p.suffix]) for p in beside if p.is_file()]
@@ -44,7 +45,7 @@ class Album:
         except OSError as error:
             source, width, height = "", 0, 0
             note = f"{path.name}: {error.strerror or error}"
-        return Picture(name, caption, _alt(name, caption), source, width, height, full, others, note)
+        return Picture(name, caption, _alt(name, alt or caption), source, width, height, full, others, note)
 
 
 def _alt(name: str, caption: str) -> str:

@@ -45,7 +45,7 @@ def run_page(folder: Path, place: Place) -> Page:
     sections = [
         Section("result", "What came out", [verdict, *_tables(result), *_by_context(result)]),
         Section("figures", "Figures", _figures(folder, result, place)),
-        Section("asked", "What was asked", _asked(folder, place)),
+        Section("asked", "What was asked", asked(folder, place)),
         Section("environment", "Environment", _environment(provenance, result)),
         Section("files", "Files", _files(folder, place), printed=False),
     ]
@@ -185,7 +185,8 @@ def _picture(album: Album, path: Path, result: dict[str, Any]) -> Picture:
     return album.picture(path, caption, name)
 
 
-def _asked(folder: Path, place: Place) -> list[Block]:
+def asked(folder: Path, place: Place, command: str = "dsfit run config.toml") -> list[Block]:
+    """The config, and the command that takes it."""
     path = folder / "config.toml"
     try:
         text = path.read_bytes().decode(errors="replace")
@@ -193,7 +194,7 @@ def _asked(folder: Path, place: Place) -> list[Block]:
         return [Text([f"config.toml is missing ({error.strerror})."])]
     return [
         Text(["Every setting, those left to their defaults too. The same numbers, all but the seconds, come from:"]),
-        Code("dsfit run config.toml", "command"),
+        Code(command, "command"),
         Fold("config.toml", [Code(text, "config.toml"), Files([place.link(path)])], printed=True),
     ]
 

@@ -60,6 +60,10 @@ def make_page(folder: Path, place: Place, root: Path) -> Page:
         from dsfit.report.figures import figures_page
 
         return figures_page(folder, place, root)
+    if there & {"sweep.json", "cells.log"}:
+        from dsfit.report.sweep import sweep_page
+
+        return sweep_page(folder, place)
     if there & {"config.toml", "result.json"}:
         from dsfit.report.run import run_page
 
