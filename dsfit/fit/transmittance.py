@@ -5,6 +5,10 @@ Light reaches a fibre behind n others weakened by `T_f = d_f prod_k a_f(theta^k)
 the two natural alternatives, a truncated Gaussian with and without a free centre, and says what each costs.
 One-dimensional: densities are per radian of theta on [-pi/2, pi/2].
 
+What a factor a_f(theta)^n of the integrand asks of a law depends on what else is counted: by itself, per radian of
+theta, it is a_f^n; per solid angle, as d omega = cos(theta) dtheta dphi, a_f^n cos(theta); with the integrand's own
+cosine (4), a_f^n cos^2(theta). `cosines` says how many.
+
 Centres and widths stay between the bounds of `proposals.TransmittanceGaussian`, so that what is found can be given to
 that law. The bounds matter where a_f^n is no hill: a_f of black hair has its least value near the normal plane and
 grows towards both ends, and without bounds the best Gaussian is one of infinite width, or an exponential slope whose
@@ -22,7 +26,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsfit.errors import InputError, check_range
+from dsfit.errors import InputError, as_number, check_range
 from dsfit.fit.objectives import excess_residuals
 from dsfit.fit.solvers import minimise
 from dsfit.frame import HALF_PI
@@ -41,8 +45,8 @@ _REACH = 8.0  # longest step: far enough to arrive at a bound, which lies at inf
 
 @dataclass(frozen=True)
 class TransmittanceFit:
-    """Laws for `P*(theta) ~ a_f(theta)^n` at one n; angles in radians, excess = chi-square divergence of P* from the
-    law.
+    """Laws for `P*(theta) ~ a_f(theta)^n cos(theta)^cosines` at one n; angles in radians, excess = chi-square
+    divergence of P* from the law.
 
     Attributes:
         mean, std: moments of P*.
@@ -72,8 +76,9 @@ def fit_transmittance(
     solver: str = "optimistix.lm",
     panels: int = 40,
     degree: int = 16,
+    cosines: float = 0.0,
 ) -> list[TransmittanceFit]:
-    """Fit truncated Gaussians to a_f(theta)^n for every n.
+    """Fit truncated Gaussians to a_f(theta)^n cos(theta)^cosines for every n.
 
     Args:
         bsdf: anything with `averages(theta).a_f` of shape [..., C], such as `DualScattering`; the mean over channels
@@ -81,10 +86,12 @@ def fit_transmittance(
         n_values: numbers of fibres, real, >= 0.
         solver: name of a solver for least squares.
         panels, degree: Gauss-Legendre quadrature in theta, `panels` pieces of `degree` nodes.
+        cosines: power of cos(theta) beside a_f^n: 0 per radian, 1 per solid angle, 2 with the integrand's cosine.
 
     Raises:
-        InputError: n is negative or not finite, or a_f is negative, not finite or zero everywhere.
+        InputError: n or `cosines` is negative or not finite, or a_f is negative, not finite or zero everywhere.
     """
+    cosines = as_number("cosines", cosines, 0.0)
     numbers = check_range("n_values", torch.as_tensor(n_values, dtype=torch.float64).reshape(-1), 0.0)
     theta, weight = panel_points(torch.linspace(-HALF_PI, HALF_PI, panels + 1, dtype=torch.float64), degree)
     theta, weight = theta.reshape(-1), weight.reshape(-1)
@@ -93,12 +100,13 @@ def fit_transmittance(
         a_f = check_range("averages.a_f", a_f.reshape(len(theta), -1), 0.0).mean(-1)
     if not float(a_f.max()) > 0:
         raise InputError("averages.a_f", 0.0, "attenuation that is not zero everywhere")
-    return [_fit_one(float(n), theta, weight, a_f, solver) for n in numbers]
+    return [_fit_one(float(n), theta, weight, a_f, cosines, solver) for n in numbers]
 
 
-def _fit_one(n: float, theta: Tensor, weight: Tensor, a_f: Tensor, solver: str) -> TransmittanceFit:
+def _fit_one(n: float, theta: Tensor, weight: Tensor, a_f: Tensor, cosines: float, solver: str) -> TransmittanceFit:
     # exp(n log a_f) in logs throughout, with 0^0 = 1; the largest is scaled to 1 so that no n underflows.
     log_target = torch.where(a_f > 0, n * torch.log(torch.where(a_f > 0, a_f, 1.0)), 0.0 if n == 0 else -math.inf)
+    log_target = log_target + cosines * torch.log(torch.cos(theta))
     log_target = log_target - log_target.max()
     log_best = log_target - torch.log((weight * log_target.exp()).sum())
     best = log_best.exp()

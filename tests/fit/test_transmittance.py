@@ -48,6 +48,15 @@ def test_cosine_attenuation_makes_the_cosine_law_exact_at_one():
     assert rows[1].excess_cosine == pytest.approx(32 / (3 * math.pi**2) - 1, rel=1e-9)
 
 
+def test_cosines_count_like_attenuation():
+    """a_f = cos once per fibre is the same target as one more cosine of the measure."""
+    measured = fit_transmittance(Fake(torch.cos), [0, 1], cosines=1.0)
+    plain = fit_transmittance(Fake(torch.cos), [1, 2])
+    for one, other in zip(measured, plain, strict=True):
+        assert one.std == pytest.approx(other.std, rel=1e-12) and one.width == pytest.approx(other.width, rel=1e-6)
+        assert one.excess_cosine == pytest.approx(other.excess_cosine, abs=1e-12)
+
+
 def test_no_fibres_is_uniform_and_large_n_does_not_underflow():
     rows = fit_transmittance(Fake(lambda t: 0.7 * torch.cos(t) ** 0.25), [0, 1e5])
     assert rows[0].std == pytest.approx(math.pi / math.sqrt(12), rel=1e-9) and rows[0].excess < 1e-6
@@ -57,6 +66,8 @@ def test_no_fibres_is_uniform_and_large_n_does_not_underflow():
 def test_bad_input():
     with pytest.raises(InputError, match="n_values"):
         fit_transmittance(Fake(torch.cos), [1, -1])
+    with pytest.raises(InputError, match="cosines"):
+        fit_transmittance(Fake(torch.cos), [1], cosines=-1.0)
     with pytest.raises(InputError, match="a_f"):
         fit_transmittance(Fake(lambda t: 0 * t), [1])
     with pytest.raises(InputError, match="a_f"):
