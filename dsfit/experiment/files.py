@@ -36,7 +36,12 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 def write_json(path: str | Path, data: Any) -> None:
     """Write JSON with sorted keys; nan and inf, which JSON lacks, become the strings "nan", "inf", "-inf"."""
-    write_bytes(path, (json.dumps(_plain(data), indent=1, sort_keys=True, allow_nan=False) + "\n").encode())
+    write_bytes(path, json_bytes(data))
+
+
+def json_bytes(data: Any) -> bytes:
+    """What `write_json` writes."""
+    return (json.dumps(_plain(data), indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
 
 
 def _plain(data: Any) -> Any:

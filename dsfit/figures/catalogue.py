@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -55,12 +56,26 @@ class Entry:
 
     def numbers_version(self) -> str:
         """Hash of all code that decides the numbers: dsfit without what only shows them, and the experiment's module
-        with those of the folder that it imports."""
+        with those of the folder that it imports, without comments and what is only told (title, rules, minutes)."""
         return _digest(sources_hash(numbers=True), self.root, f"{FOLDER}.{self.name}")
 
     def drawing_version(self) -> str:
         """Hash of all code that decides figures and tables."""
         return _digest(sources_hash(), self.root, f"{FOLDER}.drawing.{self.name}")
+
+    def description(self) -> dict[str, Any]:
+        """What is told of it, as plain data; `reproduces` in words, by pattern."""
+        experiment = self.experiment
+        return {
+            "title": experiment.title,
+            "shows": experiment.shows,
+            "minutes": experiment.minutes,
+            "reproduces": {pattern: str(rule) for pattern, rule in experiment.reproduces.items()},
+        }
+
+
+class BrokenExperiment(RuntimeError):
+    """An experiment whose module cannot be imported, or does not define what it must."""
 
 
 def names(root: Path) -> list[str]:
@@ -73,6 +88,7 @@ def find(root: str | Path, name: str) -> Entry:
 
     Raises:
         InputError: there is none.
+        BrokenExperiment: it cannot be imported.
     """
     root = Path(root).resolve()
     known = names(root)
@@ -80,14 +96,39 @@ def find(root: str | Path, name: str) -> Entry:
         raise InputError("experiment", name, ", ".join(known) + did_you_mean(name, known))
     if str(root) not in sys.path:
         sys.path.insert(0, str(root))
-    return Entry(name, root, importlib.import_module(f"{FOLDER}.{name}").EXPERIMENT)
+    try:
+        experiment = importlib.import_module(f"{FOLDER}.{name}").EXPERIMENT
+    except Exception as error:  # whatever a module does when it is imported
+        raise BrokenExperiment(f"{FOLDER}/{name}.py: {type(error).__name__}: {error}") from error
+    if not isinstance(experiment, Experiment):
+        raise BrokenExperiment(f"{FOLDER}/{name}.py: EXPERIMENT is no dsfit.figures.Experiment")
+    return Entry(name, root, experiment)
 
 
 def _digest(base: str, root: Path, module: str) -> str:
     digest = hashlib.sha256(base.encode())
     for path in sorted(_closure(root, module, {})):
-        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + _code(path).encode() + b"\0")
     return digest.hexdigest()[:12]
+
+
+_TOLD = ("title", "shows", "minutes", "reproduces", "needs", "small")
+
+
+def _code(path: Path) -> str:
+    """A module without comments, docstrings and what an experiment only tells of itself."""
+    tree = ast.parse(path.read_bytes())
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list) and body and _is_docstring(body[0]):
+            body[0] = ast.Pass()
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Experiment":
+            node.keywords = [keyword for keyword in node.keywords if keyword.arg not in _TOLD]
+    return ast.unparse(tree)
+
+
+def _is_docstring(node: ast.AST) -> bool:
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
 def _closure(root: Path, module: str, seen: dict[Path, None]) -> dict[Path, None]:

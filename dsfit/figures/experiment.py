@@ -2,17 +2,42 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dsfit.errors import InputError
 from dsfit.experiment.sections import Section
 from dsfit.figures.data import Data
 from dsfit.figures.rules import Rule
 
 if TYPE_CHECKING:
     from dsfit.experiment.rundir import RunDirectory
+
+
+@dataclass
+class Used:
+    """Files by their hashes, and configs with their changes and run ids."""
+
+    files: dict[str, str] = field(default_factory=dict)
+    runs: list[tuple[str, list[str], str]] = field(default_factory=list)
+
+    def is_unchanged(self, root: Path) -> bool:
+        """Whether files are what they were, and configs would run what they ran."""
+        from dsfit.experiment.provenance import run_id
+        from dsfit.experiment.validation import load
+
+        try:
+            return all(
+                hashlib.sha256((root / path).read_bytes()).hexdigest() == found for path, found in self.files.items()
+            ) and all(
+                run_id(load(root / "configs" / config, tuple(changes)).config) == found
+                for config, changes, found in self.runs
+            )
+        except (InputError, OSError):
+            return False
 
 
 @dataclass(frozen=True)
@@ -24,11 +49,26 @@ class Work:
             is still there.
         root: the folder that holds `configs` and `experiments`.
         say: tells what goes on.
+        used: what was read besides the settings, filled by `run` and `file`: if any of it changes, the data are out of
+            date.
     """
 
     folder: Path
     root: Path
     say: Callable[[str], None]
+    used: Used = field(default_factory=Used)
+
+    def file(self, path: str) -> Path:
+        """A file below the root that the experiment reads, such as a measured map.
+
+        Raises:
+            InputError: there is none.
+        """
+        found = self.root / path
+        if not found.is_file():
+            raise InputError(path, "no such file", f"a file below {self.root}")
+        self.used.files[path] = hashlib.sha256(found.read_bytes()).hexdigest()
+        return found
 
     def run(self, config: str, overrides: tuple[str, ...] = ()) -> RunDirectory:
         """Run `configs/CONFIG` as `dsfit run` does, in this process and on one thread; cells of an earlier attempt are
@@ -39,9 +79,11 @@ class Work:
             RunFailure: cells failed.
         """
         from dsfit.experiment import runner
+        from dsfit.experiment.provenance import run_id
         from dsfit.experiment.validation import load
 
         experiment = load(self.root / "configs" / config, overrides)
+        self.used.runs.append((config, list(overrides), run_id(experiment.config)))
         return runner.run(experiment, self.folder / "runs", workers=0, progress=_Say(self.say)).directory
 
 

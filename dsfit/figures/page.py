@@ -7,6 +7,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from dsfit.experiment.about import About
+from dsfit.experiment.about import about as make_about
 from dsfit.experiment.plots.style import new_figure, save
 from dsfit.figures.adopt import adopt
 
@@ -37,6 +39,17 @@ class Page:
         adopt(figure, self.width)
         return figure
 
-    def save(self, figure: Figure, folder: Path, name: str) -> list[Path]:
-        """Write it as PNG and PDF."""
-        return save(figure, folder, name)
+    def save(
+        self, figure: Figure, folder: Path, name: str, about: About | None = None, *, pgf: bool = False
+    ) -> list[Path]:
+        """Write it as PNG and PDF, at wish as PGF too; returns the paths.
+
+        Raises:
+            InputError: PGF is asked for, and there is no TeX system.
+        """
+        written = save(figure, folder, name, about)
+        if pgf:
+            from dsfit.figures.pgf import write_pgf
+
+            written += write_pgf(figure, folder, name, about or make_about(name))
+        return written

@@ -1,19 +1,25 @@
 """What is known of an experiment in an output directory: what it was made from, and the hashes of what it made.
 
-OUT/manifest.json               all experiments: state, seconds, files with their hashes
+OUT/manifest.json               all experiments: state, settings, seconds, files with their hashes, captions
+OUT/thesis.tex                  a document with every figure and table
 OUT/NAME/data.npz data.json     what was computed
 OUT/NAME/settings.toml          with these settings
 OUT/NAME/computed.json          from this code, when, where; written last
-OUT/NAME/figures/*.png *.pdf    drawn from the data
+OUT/NAME/figures/*.png *.pdf    drawn from the data, at wish *.pgf
 OUT/NAME/tables/*.md *.tex
 OUT/NAME/drawn.json             from this data and code; written last
+OUT/NAME/failed.json            why the last attempt came to nothing, if it did
 OUT/NAME/files/                 whatever else the experiment keeps: run directories, images
 OUT/NAME/log.txt                what the last attempt said
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import os
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +27,23 @@ from dsfit.errors import InputError
 from dsfit.experiment import files
 from dsfit.figures.data import SCHEMA_VERSION, data_hash
 
+COMPUTED, DRAWN, FAILED = "computed.json", "drawn.json", "failed.json"
+DATA = ("data.json", "data.npz")
+
 
 def file_hash(path: Path) -> str:
     """SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def hashes(folder: Path, paths: list[Path]) -> dict[str, str]:
+    """SHA-256 of files by their names within the folder, sorted."""
+    return {path.relative_to(folder).as_posix(): file_hash(path) for path in sorted(paths)}
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """`computed.json` or `drawn.json`, empty if missing or damaged."""
+    """A state file, empty if missing or damaged."""
     try:
         return files.read_json(path, SCHEMA_VERSION)
     except InputError:
@@ -36,38 +51,53 @@ def read_state(path: Path) -> dict[str, Any]:
 
 
 def write_state(path: Path, state: dict[str, Any]) -> None:
-    """Write `computed.json` or `drawn.json`."""
+    """Write a state file."""
     files.write_json(path, {"schema_version": SCHEMA_VERSION, **state})
 
 
-def is_computed(folder: Path, key: str) -> bool:
-    """Whether the data are there, whole, and made from what `key` stands for."""
-    state = read_state(folder / "computed.json")
+def has_data(folder: Path) -> bool:
+    """Whether data are there that belong together: the state file written last names their hash."""
     try:
-        return state.get("key") == key and state.get("data") == data_hash(folder)
+        return read_state(folder / COMPUTED).get("data") == data_hash(folder)
     except OSError:
         return False
 
 
 def is_drawn(folder: Path, key: str) -> bool:
     """Whether figures and tables are there, whole, and made from what `key` stands for."""
-    state = read_state(folder / "drawn.json")
+    state = read_state(folder / DRAWN)
     try:
         return state.get("key") == key and all(file_hash(folder / name) == h for name, h in state["files"].items())
     except (OSError, KeyError, AttributeError):
         return False
 
 
-def write_manifest(out: Path) -> dict[str, Any]:
-    """Collect the state of every experiment below `out` into `manifest.json`; returns it."""
-    found: dict[str, Any] = {}
-    for path in sorted(out.glob("*/computed.json")):
-        folder = path.parent
-        computed, drawn = read_state(path), read_state(folder / "drawn.json")
-        if not computed:
-            continue
-        data = {name: file_hash(folder / name) for name in ("data.json", "data.npz") if (folder / name).is_file()}
-        found[folder.name] = {"computed": computed, "drawn": drawn, "files": {**data, **drawn.get("files", {})}}
-    manifest = {"schema_version": SCHEMA_VERSION, "experiments": found}
-    files.write_json(out / "manifest.json", manifest)
-    return manifest
+@contextlib.contextmanager
+def lock(folder: Path, waiting: Callable[[], None] = lambda: None) -> Iterator[int]:
+    """Keep other processes out of a folder until the block ends, or wait until they are done (where the system has
+    file locks); yields the lock's file descriptor.
+
+    A process that inherits the descriptor holds the lock too, so that it stays while either lives.
+
+    Args:
+        folder: is made if it is not there.
+        waiting: called again and again while another process holds the lock; what it raises ends the waiting.
+    """
+    try:
+        import fcntl
+    except ImportError:  # pragma: no cover (Windows)
+        yield -1
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    handle = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT)
+    try:
+        while True:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except OSError:
+                waiting()
+                time.sleep(0.1)
+        yield handle
+    finally:
+        os.close(handle)

@@ -6,19 +6,22 @@ import json
 import sys
 from pathlib import Path
 
+DONE = "done: "
+
 
 def main(text: str) -> None:
     """Make the experiment that the job (JSON) names."""
     import torch
 
     from dsfit.figures.catalogue import find
-    from dsfit.figures.make import make
+    from dsfit.figures.make import Look, make
 
     torch.set_num_threads(1)
     job = json.loads(text)
-    entry = find(job.pop("root"), job.pop("name"))
-    done = make(entry, Path(job.pop("out")), job.pop("overrides"), say=lambda what: print(what, flush=True), **job)
-    print(json.dumps(done), flush=True)
+    entry, look = find(job.pop("root"), job.pop("name")), Look(**job.pop("look"))
+    out, overrides = Path(job.pop("out")), job.pop("overrides")
+    done = make(entry, out, overrides, say=lambda what: print(what, flush=True), look=look, **job)
+    print(DONE + json.dumps(done), flush=True)
 
 
 if __name__ == "__main__":
