@@ -9,6 +9,7 @@ from typing import Any
 from rich.table import Table
 
 from dsfit.experiment.files import number
+from dsfit.experiment.report_tables import markdown_row
 
 
 def _short(value: Any) -> str:
@@ -72,11 +73,11 @@ def markdown(result: dict[str, Any]) -> str:
     """The same numbers as a Markdown table, and what happens beyond the contexts of the training."""
     lines = [f"# {_title(result)}", "", "| fibre | " + " | ".join(f"{a} {b}" for a, b, _ in _COLUMNS) + " |"]
     lines.append("|---|" + "---:|" * len(_COLUMNS))
-    lines += [f"| {c['label']} | " + " | ".join(text(c) for _, _, text in _COLUMNS) + " |" for c in result["cells"]]
+    lines += [markdown_row([c["label"], *(text(c) for _, _, text in _COLUMNS)]) for c in result["cells"]]
     lines += ["", caption(result), "", "Beyond the training (- where no light is left in float64):", ""]
     places = [(b["theta_r_deg"], b["n"]) for b in result["cells"][0]["beyond"]]
     lines.append("| fibre | " + " | ".join(f"{t:.4g}°, n {n:g}" for t, n in places) + " |")
     lines.append("|---|" + "---:|" * len(places))
     for cell in result["cells"]:
-        lines.append(f"| {cell['label']} | " + " | ".join(_short(b["excess"]) for b in cell["beyond"]) + " |")
+        lines.append(markdown_row([cell["label"], *(_short(b["excess"]) for b in cell["beyond"])]))
     return "\n".join([*lines, ""])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from rich.table import Table
 
 
@@ -18,4 +20,9 @@ def rich_table(title: str, lines: list[list[str]]) -> Table:
 def markdown_table(title: str, lines: list[list[str]]) -> str:
     """The same with its title as a heading."""
     rule = ["---", *["---:"] * (len(lines[0]) - 1)]
-    return f"# {title}\n\n" + "\n".join("| " + " | ".join(x) + " |" for x in [lines[0], rule, *lines[1:]]) + "\n"
+    return f"# {title}\n\n" + "\n".join(map(markdown_row, [lines[0], rule, *lines[1:]])) + "\n"
+
+
+def markdown_row(cells: Iterable[str]) -> str:
+    """A row of a Markdown table; pipes in names do not part cells."""
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from dsfit.experiment import amortise_report, check_report, compare_render_report, race_report, render_report
 from dsfit.experiment.files import number
+from dsfit.experiment.report_tables import markdown_row
 
 
 def rows(cells: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -205,11 +206,11 @@ def markdown(result: dict[str, Any]) -> str:
     if result["kind"] == "transmittance":
         head = ["fibre", "n", *_FIT_COLUMNS]
         body = [head, ["---"] * len(head), *_transmittance_rows(result)]
-        return f"# {_title(result)}\n\n" + "\n".join("| " + " | ".join(row) + " |" for row in body) + "\n"
+        return f"# {_title(result)}\n\n" + "\n".join(map(markdown_row, body)) + "\n"
     lines = [f"# {_title(result)}", "", "| method | " + " | ".join(f"{a} {b}" for a, b, _ in _COLUMNS) + " |"]
     lines.append("|---|" + "---:|" * len(_COLUMNS))
     for row in rows(result["cells"]):
-        lines.append(f"| {row['name']} | " + " | ".join(text(row) for _, _, text in _COLUMNS) + " |")
+        lines.append(markdown_row([row["name"], *(text(row) for _, _, text in _COLUMNS)]))
     return "\n".join([*lines, "", caption(result), ""])
 
 

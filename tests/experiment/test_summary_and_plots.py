@@ -141,3 +141,11 @@ def test_labels_of_minor_ticks_stay_formulas(tmp_path: Path) -> None:
     assert any("$" in label.get_text() for label in labels)
     assert all(label.get_parse_math() for label in labels)
     assert not axes.title.get_parse_math()
+
+
+def test_a_pipe_in_a_name_does_not_part_cells() -> None:
+    data = result()
+    for cell in data["cells"]:
+        cell["methods"][2]["name"] = "fit | all"
+    line = next(line for line in summary.markdown(data).splitlines() if "fit" in line)
+    assert line.startswith("| fit \\| all | ") and line.replace("\\|", "").count("|") == 13
