@@ -147,5 +147,5 @@ def test_a_pipe_in_a_name_does_not_part_cells() -> None:
     data = result()
     for cell in data["cells"]:
         cell["methods"][2]["name"] = "fit | all"
-    line = next(line for line in summary.markdown(data).splitlines() if "fit" in line)
+    line = next(line for line in summary.markdown(data).splitlines() if "fit \\" in line)
     assert line.startswith("| fit \\| all | ") and line.replace("\\|", "").count("|") == 13
