@@ -31,10 +31,10 @@ def compute(settings: ErrorTime, work: Work) -> Data:
 
     Arrays by method: `excess.METHOD` `[contexts]`, M(p)/M* - 1, `variance.METHOD`, the relative variance of a sample
     (larger: channels differ from direction to direction even where the density is the best one), and `weight.METHOD`,
-    the largest weight |F| / (p int |F|), by quadrature; `rmse.METHOD` `[contexts, samples]`, measured
-    root mean squares of the relative error, and their standard errors `rmse_error.METHOD`; `time.METHOD` `[contexts, samples, 3]`, quartiles of the seconds of an
-    estimate, and `per_sample.METHOD`, `fit_time.METHOD` `[contexts]`, seconds per sample and of the fit. `samples` are
-    the numbers of samples.
+    the largest weight |F| / (p int |F|), by quadrature; `rmse.METHOD` `[contexts, samples]`, measured root mean squares
+    of the relative error, and their standard errors `rmse_error.METHOD`; `time.METHOD` `[contexts, samples, 3]`,
+    quartiles of the seconds of an estimate, and `per_sample.METHOD`, `fit_time.METHOD` `[contexts]`, seconds per sample
+    and of the fit. `samples` are the numbers of samples.
     """
     quoted = ", ".join(f'"{name}"' for name in settings.fibres)
     overrides = (

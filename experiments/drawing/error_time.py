@@ -226,7 +226,8 @@ def _contexts(data: Data) -> Table:
         f"below the best heuristic mix by {ratio.min():.3g} at least, {np.median(ratio):.3g} in the median, "
         f"{ratio.max():.3g} at most, by less than 100 in {int((ratio < 100).sum())} of {len(ratio)} contexts; "
         f"{_short(float(speed.min()))}, {_short(float(np.median(speed)))} and {_short(float(speed.max()))} times "
-        "quicker to 1 %. Best single: the least of all proposals alone. Weight: the largest that a sample of the fit can have."
+        "quicker to 1 %. Best single: the least of all proposals alone. Weight: the largest that a "
+        "sample of the fit can have."
     )
     head = ["context", "", *shown, "best single", "weight"]
     return Table("contexts", caption, head, rows, "ll" + "r" * (len(shown) + 2))
