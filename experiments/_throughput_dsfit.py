@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from _throughput_timing import Contender
 from torch import Tensor
 
 import dsfit
@@ -17,6 +16,7 @@ from dsfit.frame import to_angles
 from dsfit.kernels import HairKernel
 from dsfit.proposals.amortised import AmortisedProposal
 from dsfit.streams import ContextStream
+from experiments._throughput_timing import Contender
 
 SHARED = 16
 """Samples of a context in the layout where contexts are shared."""
@@ -38,9 +38,7 @@ class Library:
         self.amortised = AmortisedProposal(self.bsdf)
         self.kernels = {f"kernel, {mode}": HairKernel(self.bsdf, self.amortised, mode=mode) for mode in modes}
         fastest = modes[-1]
-        self.parts = {
-            name: HairKernel(self.bsdf, terms=terms, mode=fastest) for name, terms in PARTS.items() if parts
-        }
+        self.parts = {name: HairKernel(self.bsdf, terms=terms, mode=fastest) for name, terms in PARTS.items() if parts}
         self.fastest = f"kernel, {fastest}"
 
     def contenders(self, count: int, layout: str, seed: int = 1) -> list[Contender]:

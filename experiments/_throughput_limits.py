@@ -6,12 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from _throughput_counts import counted, least_bytes
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
 from dsfit.race.machine import LINE
 from dsfit.streams import ContextStream
+from experiments._throughput_counts import counted, least_bytes
 
 _SAMPLES, _BATCH = 16, 256
 _MOST = 8

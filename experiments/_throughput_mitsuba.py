@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from _throughput_timing import Contender
+
+from experiments._throughput_timing import Contender
 
 LEAST_LLVM = 19
 """Mitsuba 3.9 aborts the process with LLVM 15 and 16, and its documentation asks for newer ones."""

@@ -1,0 +1,126 @@
+"""Draws rates by task and by number of directions, ratios to Mitsuba, and times against limits; tabulates all."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dsfit.experiment.plots.style import COLORS, MARKERS
+from dsfit.figures import Data, Table
+from dsfit.figures.page import Page
+from experiments._throughput_bounds import bounds
+from experiments._throughput_rows import (
+    LABELS,
+    TASKS,
+    base,
+    index,
+    layout_of,
+    libraries,
+    measured,
+    of_task,
+    rate,
+)
+from experiments.drawing._throughput_tables import limits, rates, terms
+
+WITH_CONTEXTS = {"prepare + eval": "prepare\n+ eval", "prepare + fused": "prepare\n+ all three"}
+RATIO_NAMES = {**TASKS, "fused": "sample\n+ pdf + eval", **WITH_CONTEXTS}
+
+
+def figures(data: Data, page: Page) -> dict[str, Figure]:
+    """Four pictures; that of ratios only where Mitsuba was there."""
+    record = data.record
+    found = {}
+    for name, height, draw in (("rates", 0.52, _bars), ("directions", 0.52, _curves), ("ratios", 0.55, _ratios),
+                               ("limits", 0.55, _roofline)):  # fmt: skip
+        if name == "ratios" and record["mitsuba"]["variant"] is None:
+            continue
+        found[name] = page.figure(height)
+        axis = found[name].subplots()
+        draw(axis, record)
+        found[name].legend(loc="outside lower center", ncols=3, frameon=False)
+    return found
+
+
+def _bars(axis: Axes, record: dict[str, Any]) -> None:
+    """Each contender with the number of directions that suits it best."""
+    names = libraries(record)
+    width = 0.8 / max(len(names), 1)
+    for k, library in enumerate(names):
+        label: str | None = LABELS[library]
+        for j, task in enumerate(TASKS):
+            row = max(of_task(record, library, task, layout_of(library)), key=rate, default=None)
+            if row is None:
+                continue
+            value, ends = rate(row), [rate(row, key) for key in ("high", "low")]
+            at = j + (k - (len(names) - 1) / 2) * width
+            error = [[max(value - ends[0], 0.0)], [max(ends[1] - value, 0.0)]]
+            axis.bar(at, value, width, color=COLORS[k], label=label, yerr=error, error_kw={"linewidth": 0.8})
+            axis.annotate(f"{value:.2g}", (at, max(ends[1], value)), ha="center", va="bottom", fontsize=8)
+            label = None
+    axis.set_xticks(range(len(TASKS)), list(TASKS.values()))
+    axis.set_yscale("log")
+    axis.set_ylabel("million directions / s, one core")
+    axis.margins(y=0.12)
+
+
+def _curves(axis: Axes, record: dict[str, Any]) -> None:
+    for k, library in enumerate(libraries(record)):
+        for task, line, what in (("eval", "-", "eval"), ("fused", "--", "all three")):
+            rows = of_task(record, library, task, layout_of(library))
+            if rows:
+                x, y = [row["count"] for row in rows], [rate(row) for row in rows]
+                ends = [[rate(row, key) for row in rows] for key in ("high", "low")]
+                label = f"{LABELS[library]}, {what}"
+                axis.plot(x, y, line, color=COLORS[k], marker=MARKERS[k], markersize=4, label=label)
+                axis.vlines(x, *ends, color=COLORS[k], linewidth=0.8)
+    axis.set(xscale="log", yscale="log", xlabel="directions per call", ylabel="million directions / s, one core")
+    axis.grid(True)
+
+
+def _ratios(axis: Axes, record: dict[str, Any]) -> None:
+    """Of the compiled kernel to Mitsuba, by task, layout and threads, each for the most directions that both did."""
+    rows = index(record)
+    seen = {(row["threads"], row["layout"]) for row in record["rows"] if row["library"] == "kernel, compiled"}
+    kinds = sorted(seen, key=lambda kind: (kind[0], kind[1] != "all different"))
+    for k, (thread, layout) in enumerate(kinds):
+        label: str | None = f"{thread} thread{'s' if thread > 1 else ''}, {layout}"
+        for j, task in enumerate(RATIO_NAMES):
+            both = [
+                (row, other)
+                for key, row in rows.items()
+                if key[:3] == ("kernel, compiled", task, layout) and key[4] == thread
+                if (other := base(record, rows, task, key[3], thread)) is not None
+            ]
+            if not both:
+                continue
+            row, other = max(both, key=lambda pair: pair[0]["count"])
+            value, at = rate(row) / rate(other), j + (k - (len(kinds) - 1) / 2) * 0.25
+            ends = [rate(row, one) / rate(other, two) for one, two in (("high", "low"), ("low", "high"))]
+            axis.bar(at, value, 0.25, color=COLORS[k], label=label)
+            axis.vlines(at, *ends, color="black", linewidth=0.8)
+            label = None
+    axis.axhline(1.0, color="black", linewidth=0.8)
+    axis.set_xticks(range(len(RATIO_NAMES)), list(RATIO_NAMES.values()))
+    axis.set_ylabel("rate of the compiled kernel / Mitsuba")
+
+
+def _roofline(axis: Axes, record: dict[str, Any]) -> None:
+    counts = record.get("counts", {})
+    tasks = [task for task in TASKS if task in counts]
+    for j, task in enumerate(tasks):
+        bottom = 0.0
+        for k, (name, seconds) in enumerate(bounds(record["machine"], counts[task]).items()):
+            axis.bar(j - 0.2, 1e9 * seconds, 0.35, bottom=bottom, color=COLORS[k], label=None if j else name)
+            bottom += 1e9 * seconds
+        axis.bar(j + 0.2, measured(record, task), 0.35, color="#444444", label=None if j else "measured")
+    axis.set_xticks(range(len(tasks)), [TASKS[task] for task in tasks])
+    axis.set_ylabel("ns per direction, one core")
+    axis.set_title("left: each resource by itself; right: measured, where they overlap")
+
+
+def tables(data: Data) -> list[Table]:
+    """Rates with ratios to Mitsuba, costs of terms, limits."""
+    found = [rates(data.record), terms(data.record), limits(data.record)]
+    return [table for table in found if table.rows]
