@@ -19,32 +19,33 @@ from dsfit.fit.amortise.train import TRAINING, amortise
 from dsfit.proposals import chapter_proposals
 from dsfit.proposals.family import FamilyProposal
 
-LEVELS = {"median": 0.5, "p95": 0.95, "p99": 0.99, "worst": 1.0}
+LEVELS = {"median": 0.5, "p95": 0.95, "p99": 0.99}
 _LEAST = 1e-9
 _RESAMPLES = 200
 
 
-def quantiles(excess: Any, unit: Any, levels: Any = tuple(LEVELS.values())) -> tuple[np.ndarray, np.ndarray]:
-    """log10 of quantiles of an excess `[views, pairs]`, and their standard errors by the bootstrap over units: the
-    fibre, or the view, `[views]`, that each row belongs to. The errors of extremes, and of a single unit, are inf."""
-    level, log = np.asarray(levels), np.log10(np.maximum(np.asarray(excess, dtype=np.float64), _LEAST))
-    unit = np.asarray(unit)
+def quantiles(excess: Any, unit: Any, levels: Any = tuple(LEVELS.values())) -> dict[str, np.ndarray]:
+    """Quantiles of an excess `[views, pairs]`: log10 of them; their standard errors by the bootstrap over units, the
+    fibre or the view, `[views]`, that each row belongs to (0 for a single unit); and the largest excess of all."""
+    log = np.log10(np.maximum(np.asarray(excess, dtype=np.float64), _LEAST))
+    unit, level = np.asarray(unit), np.asarray(levels)
     if not log.size:
-        return np.full(len(level), np.nan), np.full(len(level), np.inf)
+        none = np.full(len(level), np.nan)
+        return {"log10": none, "log10_error": none, "worst": np.array(np.nan)}
     parts = [log[unit == k].ravel() for k in np.unique(unit)]
     random = np.random.default_rng(0)
     drawn = []
     for _ in range(_RESAMPLES):
         chosen = random.integers(len(parts), size=len(parts))
         drawn.append(np.quantile(np.concatenate([parts[k] for k in chosen]), level))
-    error = np.std(drawn, axis=0, ddof=1) if len(parts) > 1 else np.full(len(level), np.inf)
-    error[(level == 0) | (level == 1)] = np.inf
-    return np.quantile(log, level), error
+    error = np.std(drawn, axis=0, ddof=1)
+    return {"log10": np.quantile(log, level), "log10_error": error, "worst": np.array(10 ** log.max())}
 
 
-def named(prefix: str, found: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
-    """`quantiles` as arrays of a data file."""
-    return {f"{prefix}.log10": found[0], f"{prefix}.log10_error": found[1]}
+def named(prefix: str, *found: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """`quantiles` as arrays of a data file; several of them stacked."""
+    several = len(found) > 1
+    return {f"{prefix}.{key}": np.array([one[key] for one in found]) if several else found[0][key] for key in found[0]}
 
 
 def worst(targets: FamilyTargets, excess: np.ndarray, count: int) -> list[dict[str, float]]:
@@ -136,7 +137,7 @@ def against_exact(
 
 def against_own(
     family: FamilyProposal, bsdf: dsfit.DualScattering, size: Any
-) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], float]:
+) -> tuple[dict[str, dict[str, np.ndarray]], float]:
     """Quantiles of the family's proposal and of one trained for this fibre alone, at contexts that neither has seen;
     and the seconds of that training."""
     table = bsdf.replace(precision="table")

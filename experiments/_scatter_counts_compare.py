@@ -14,7 +14,7 @@ ALBEDOS = (0.3, 0.7)
 GROUPS = 20
 """Of rays, one of which the jackknife leaves out at a time."""
 _RAYS_IN_BIN = 60
-_LEAST_IN_BIN = 10
+LEAST_IN_BIN = 10
 
 
 def compare(n: Tensor, exact: Tensor) -> dict[str, float]:
@@ -59,33 +59,34 @@ def brief(n: Tensor, exact: Tensor) -> dict[str, float]:
     return {name: float(value) for name, value in found.items()}
 
 
-def with_errors(statistics: Callable[..., dict[str, float]], *values: Tensor) -> dict[str, float]:
-    """`statistics(*values)` and their standard errors as `NAME_error`, by the jackknife over groups of rays; those of
-    shares are one ray's at least, where no ray of a kind was met."""
+def with_errors(prefix: str, statistics: Callable[..., dict[str, float]], *values: Tensor) -> dict[str, float]:
+    """`statistics(*values)` as `PREFIX.NAME`, and their standard errors as `error.PREFIX.NAME`, by the jackknife over
+    groups of rays; an error is one ray's share at least, where no ray of a kind was met."""
     rays = len(values[0])
     group = torch.arange(rays) % min(GROUPS, rays)
     parts = [statistics(*(value[group != k] for value in values)) for k in range(int(group.max()) + 1)]
     found = statistics(*values)
     factor = math.sqrt(len(parts) - 1)
     errors = {name: factor * float(np.std([part[name] for part in parts])) for name in found}
-    return found | {f"{name}_error": max(error, 1 / rays) for name, error in errors.items()}
+    named = {f"error.{prefix}.{name}": max(error, 1 / rays) for name, error in errors.items()}
+    return {f"{prefix}.{name}": value for name, value in found.items()} | named
 
 
 def bins(n: Tensor, exact: Tensor) -> dict[str, np.ndarray]:
-    """By bin of n, whose ends are `EDGES`: rays, mean n, share of N = 0 and its standard error (inf, and zeros for the
-    means, where there are fewer than ten rays)."""
+    """By bin of n, whose ends are `EDGES`: rays, mean n, share of N = 0 and its standard error; where there are fewer
+    than ten rays both are 0 and the error 1, as nothing is known there."""
     rows = []
     for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):
         inside = (n >= low) & (n < high)
         count = int(inside.sum())
-        if count < _LEAST_IN_BIN:
-            rows.append((count, 0.0, math.inf, 0.0, math.inf))
+        if count < LEAST_IN_BIN:
+            rows.append((count, 0.0, 0.0, 1.0))
             continue
         share = float((exact[inside] == 0).to(n).mean())
         error = math.sqrt(max(share * (1 - share), 1 / count) / count)
-        mean, mean_error = float(n[inside].mean()), float(n[inside].std()) / math.sqrt(count)
-        rows.append((count, mean, mean_error, share, error))
-    return dict(zip(("rays", "n", "n_error", "zero", "zero_error"), np.array(rows).T, strict=True))
+        rows.append((count, float(n[inside].mean()), share, error))
+    names = ("bins.rays", "bins.n", "bins.zero", "error.bins.zero")
+    return dict(zip(names, np.array(rows).T, strict=True))
 
 
 def spread(n: Tensor, exact: Tensor) -> tuple[float, float]:

@@ -87,8 +87,8 @@ def together(runs: list[list[list[tuple[int, float, float]]]]) -> dict[str, np.n
 
 def spread(values: np.ndarray) -> np.ndarray:
     """Standard deviation of a single run, of the shape of `values` `[scenes, seeds, ...]`: over the seeds of its own
-    scene or pooled over scenes, whichever is larger, as three seeds alone may happen to agree; inf for one seed."""
+    scene or pooled over scenes, whichever is larger, as three seeds alone may happen to agree; 0 for one seed."""
     if values.shape[1] < 2:
-        return np.full(values.shape, np.inf)
+        return np.zeros(values.shape)
     own = values.var(axis=1, ddof=1, keepdims=True)
     return np.broadcast_to(np.sqrt(np.maximum(own, own.mean(axis=0, keepdims=True))), values.shape).copy()

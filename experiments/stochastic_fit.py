@@ -181,8 +181,8 @@ def gradients(settings: StochasticFit, work: Work) -> dict[str, np.ndarray]:
         work.say(f"gradient, {name}")
     g = torch.Generator().manual_seed(2)
     factor, low, high = np.log10([variance_factor(rows["plain"], rows[name], g) for name in PLANS]).T
-    found_arrays = {"factor": factor, "low": low, "high": high, "error": (high - low) / (2 * 1.96)}
-    return {f"gradients.log10_{name}": value for name, value in found_arrays.items()}
+    found_arrays = {"log10_factor": factor, "log10_low": low, "log10_high": high, "error": (high - low) / (2 * 1.96)}
+    return {f"gradients.{name}": value for name, value in found_arrays.items()}
 
 
 EXPERIMENT = Experiment(
@@ -194,13 +194,13 @@ EXPERIMENT = Experiment(
     minutes=7,
     reproduces={
         "*seconds": Measured(),
-        "*_error": Measured(),  # of what the errors belong to, the estimates tell
         "start": Close(1e-5),
         "quadrature.excess": Close(0.02),
         "quadrature.evaluations": Close(0.05),
         "stream.evaluations": Close(0.05),
-        "stream.log10_*": Estimate(error="stream.log10_*_error", most=math.inf),
-        "gradients.log10_*": Estimate(error="gradients.log10_error", most=math.inf),
+        "stream.log10_median": Estimate(error="stream.log10_median_error", most=math.inf),
+        "stream.log10_worst": Estimate(error="stream.log10_worst_error", most=math.inf),
+        "gradients.log10_*": Estimate(error="gradients.error", most=math.inf),
         "*.log10_excess": Estimate(error="*.log10_excess_error", most=math.inf),
         "*.evaluations": Estimate(error="*.evaluations_error", most=math.inf),
     },

@@ -14,6 +14,7 @@ from dsfit.figures.page import Page
 
 STREAMS = {"angle": "all inclinations", "sphere": "as a renderer meets them"}
 MEDIAN, P99 = 0, 2
+"""Among the levels of quantiles."""
 
 
 def figures(data: Data, page: Page) -> dict[str, Figure]:
@@ -34,7 +35,7 @@ def _spread(axis: Axes, data: Data) -> None:
     for color, (name, label) in zip(COLORS, STREAMS.items(), strict=False):
         for stage, line in (("untrained", ":"), ("trained", "-")):
             value = 10 ** data.arrays[f"{name}.{stage}.curve.log10"]
-            axis.plot(value, np.linspace(0, 1, len(value)), line, color=color, label=f"{label}, {stage}")
+            axis.plot(value, data.record["levels"], line, color=color, label=f"{label}, {stage}")
     axis.set(xscale="log", xlabel="excess", ylabel="share of pairs below", ylim=(0, 1.01))
     axis.set_title("contexts of unseen fibres")
     axis.grid(True)
@@ -55,7 +56,7 @@ def _curve(axis: Axes, data: Data) -> None:
     axis.set(xscale="log", yscale="log", xlabel="training fibres", ylabel="excess")
     axis.set_xticks(numbers, [str(k) for k in numbers])
     axis.minorticks_off()
-    axis.set_title("trained")
+    axis.set_title("trained, with standard errors")
     axis.grid(True)
 
 
@@ -93,7 +94,8 @@ def tables(data: Data) -> list[Table]:
     caption = (
         f"Excess at {record['unseen']} unseen fibres and at the presets, none of them trained on. At "
         f"{len(arrays['mix.pairs'])} pairs the median is {middle[0]:.2g}, that of the best mix of the chapter's "
-        f"proposals {middle[1]:.2g}. Tables of a new fibre: {spent}; targets: {record['target_seconds']:.0f} s."
+        f"proposals {middle[1]:.2g}. ×/÷: the factor of one standard error, by the bootstrap over fibres (of one "
+        f"fibre: over views). Tables of a new fibre: {spent}; targets: {record['target_seconds']:.0f} s."
     )
     own = []
     for name, seconds in zip(record["own"], record["own_seconds"], strict=True):
@@ -126,9 +128,8 @@ def tables(data: Data) -> list[Table]:
 
 def _cells(arrays: Any, name: str, row: int | None = None) -> list[str]:
     """Quantiles as factors: value, and the factor by which one standard error raises it where there is one."""
-    log, error = (arrays[f"{name}.{key}"] if row is None else arrays[f"{name}.{key}"][row]
-                  for key in ("log10", "log10_error"))  # fmt: skip
-    return [
-        "" if np.isnan(x) else f"{10**x:.2g}" + (f" ×/÷ {10**e:.2f}" if np.isfinite(e) else "")
-        for x, e in zip(log, error, strict=True)
-    ]
+    log, error, worst = (arrays[f"{name}.{key}"] if row is None else arrays[f"{name}.{key}"][row]
+                         for key in ("log10", "log10_error", "worst"))  # fmt: skip
+    if np.isnan(worst):
+        return [""] * 4
+    return [*(f"{10**x:.2g} ×/÷ {10**e:.2f}" for x, e in zip(log, error, strict=True)), f"{worst:.2g}"]

@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from dsfit.experiment.plots.style import look
 from dsfit.figures import Data, Table
 from dsfit.figures.page import Page
+from experiments._scatter_counts_compare import LEAST_IN_BIN
 
 SHOWN = 48
 """Resolution of the grid whose shares of uncrossed rays are drawn, that of rendered scenes: the nearest one to it."""
@@ -23,10 +24,10 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
     arrays = data.arrays
     grid = page.figure(0.56)
     left, right = grid.subplots(1, 2)
-    _by_resolution(left, data, 100 * arrays["bias"], 100 * arrays["bias_error"])
+    _by_resolution(left, data, 100 * arrays["counts.bias"], 100 * arrays["error.counts.bias"])
     left.set_ylabel("bias of n / %")
     left.axhline(0, color="black", linewidth=0.8, zorder=0.5)
-    _by_resolution(right, data, arrays["scatter"], arrays["scatter_error"])
+    _by_resolution(right, data, arrays["counts.scatter"], arrays["error.counts.scatter"])
     right.set_ylabel("scatter of N at given n / Poisson")
     right.axhline(1, color="black", linewidth=0.8, zorder=0.5)
     grid.legend(handles=_key(data), loc="outside lower center", ncols=3, frameon=False)
@@ -90,8 +91,9 @@ def _uncrossed(axis: Axes, data: Data) -> None:
     axis.step([0, 0.5, 0.5, MOST_N], [1, 1, 0, 0], color="black", linewidth=0.8, linestyle="--")
     for k in range(len(data.record["geometries"])):
         for j, where in enumerate(data.record["points"]):
-            n, share, error = (arrays[f"bins.{name}"][k, r, j] for name in ("n", "zero", "zero_error"))
-            some = np.isfinite(error) & (n < MOST_N)
+            names = ("bins.n", "bins.zero", "error.bins.zero", "bins.rays")
+            n, share, error, rays = (arrays[name][k, r, j] for name in names)
+            some = (rays >= LEAST_IN_BIN) & (n < MOST_N)
             style = _style(k, where == "seen") | {"linestyle": "none"}
             axis.errorbar(n[some], share[some], yerr=error[some], elinewidth=0.7, **style)
     axis.set(xlabel=f"n, {resolutions[r]} voxels", ylabel="share of rays with N = 0")
@@ -104,7 +106,8 @@ def _rules(axis: Axes, data: Data) -> None:
     j = data.record["points"].index("fibres")
     for k in range(len(data.record["geometries"])):
         for rule, line in (("poisson", "-"), ("threshold", "--")):
-            value, error = arrays[f"brier_{rule}"][k, :, j], arrays[f"brier_{rule}_error"][k, :, j]
+            name = f"counts.brier_{rule}"
+            value, error = arrays[name][k, :, j], arrays[f"error.{name}"][k, :, j]
             style = _style(k, False) | {"linestyle": line}
             axis.errorbar(data.record["resolutions"], value, yerr=error, elinewidth=0.7, **style)
     _resolutions(axis, data)
@@ -158,12 +161,12 @@ def _table(data: Data, name: str, caption: str, head: list[str], cells: Any) -> 
 
 def _counts(arrays: Any, at: tuple[int, ...]) -> list[str]:
     return [
-        f"{arrays['mean_N'][at]:.2f}",
-        _percent(arrays["bias"][at], arrays["bias_error"][at]),
-        f"{arrays['few'][at]:+.3f} ± {arrays['few_error'][at]:.3f}",
-        f"{arrays['scatter'][at]:.2f} ± {arrays['scatter_error'][at]:.2f}",
-        f"{arrays['zero'][at]:.3f}",
-        f"{arrays['exp'][at]:.3f}",
+        f"{arrays['counts.mean_N'][at]:.2f}",
+        _percent(arrays["counts.bias"][at], arrays["error.counts.bias"][at]),
+        f"{arrays['counts.few'][at]:+.3f} ± {arrays['error.counts.few'][at]:.3f}",
+        f"{arrays['counts.scatter'][at]:.2f} ± {arrays['error.counts.scatter'][at]:.2f}",
+        f"{arrays['counts.zero'][at]:.3f}",
+        f"{arrays['counts.exp'][at]:.3f}",
     ]
 
 
@@ -172,20 +175,26 @@ def _percent(value: float, error: float) -> str:
 
 
 def _lit(arrays: Any, at: tuple[int, ...]) -> list[str]:
-    powers = [f"{arrays[f'{kind}power_{a}'][at]:.3f}" for a in ("0.3", "0.7") for kind in ("", "mean_")]
-    shares = [f"{100 * arrays[name][at]:.1f} %" for name in ("wrong", "wrongly_lit")]
-    return powers + shares + [f"{arrays[f'brier_{rule}'][at]:.4f}" for rule in ("poisson", "threshold")]
+    powers = [f"{arrays[f'counts.{kind}power_{a}'][at]:.3f}" for a in ("0.3", "0.7") for kind in ("", "mean_")]
+    shares = [f"{100 * arrays[f'counts.{name}'][at]:.1f} %" for name in ("wrong", "wrongly_lit")]
+    return powers + shares + [f"{arrays[f'counts.brier_{rule}'][at]:.4f}" for rule in ("poisson", "threshold")]
 
 
 def _others(arrays: Any, at: tuple[int, ...]) -> list[str]:
-    default = arrays["bias"][at], arrays["exp"][at] - arrays["zero"][at], arrays["brier_poisson"][at]
+    default = (
+        arrays["counts.bias"][at],
+        arrays["counts.exp"][at] - arrays["counts.zero"][at],
+        arrays["counts.brier_poisson"][at],
+    )
     others = zip(*(arrays[f"others.{name}"][at] for name in ("bias", "exp_less_zero", "brier")), strict=True)
-    return [f"{100 * bias:+.1f} %, {less:+.3f}, {square:.4f}" for bias, less, square in (default, *others)]
+    return [
+        f"{100 * bias:+.1f} %, {less:+.3f}, {square:.4f}" for bias, less, square in ((bias, v - zero, square), *others)
+    ]
 
 
 def _steps(arrays: Any, at: tuple[int, ...]) -> list[str]:
     steps = [f"{error:.3f}" for error in arrays["steps.rms"][at]]
-    return [f"{arrays['mean_n'][at]:.2f}", f"{arrays['deviation'][at]:.2f}", *steps]
+    return [f"{arrays['counts.mean_n'][at]:.2f}", f"{arrays['counts.deviation'][at]:.2f}", *steps]
 
 
 def _speed(data: Data) -> Table:
@@ -198,7 +207,7 @@ def _speed(data: Data) -> Table:
             cells += [f"{arrays['speed.memory'][g, r] / 1e6:.2f}", f"{arrays['speed.seconds'][g, r]:.2f}"]
             rows.append([geometry.replace("_", " "), shape, *cells])
     caption = (
-        f"Nanoseconds of one core a ray, float32, from points on fibres (auto is here {record['speed_backend']}); "
+        f"Nanoseconds of one core a ray, float32, from points on fibres (auto is here {record['speed']['backend']}); "
         "memory with both forms of the moments; seconds to fill the grid."
     )
     return Table("speed", caption, ["geometry", "grid", *record["speed_kinds"], "memory / MB", "seconds"], rows)
