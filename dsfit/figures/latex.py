@@ -52,8 +52,22 @@ _LETTERS = {"ß": r"\ss{}", "æ": r"\ae{}", "Æ": r"\AE{}", "ø": r"\o{}", "Ø":
 _LIGATURES = re.compile(r"(?<=-)(?=-)|(?<=,)(?=,)|(?<=')(?=')|(?<=[?!])(?=`)")
 
 
-def escape(text: str) -> str:
-    """The text as LaTeX in plain ASCII; a sign that is not known stands there as `[U+2603]` rather than stop TeX."""
+_SYMBOLS = re.compile(r"(?<![\w\\])([A-Za-zα-ωϑϕΑ-Ω])_([A-Za-z0-9]{1,3}|[θφσ])(?:\^([A-Za-z0-9]))?(?![\w(])")
+
+
+def escape(text: str, *, symbols: bool = True) -> str:
+    """The text as LaTeX in plain ASCII; a sign that is not known stands there as `[U+2603]` rather than stop TeX.
+
+    Args:
+        text: plain text.
+        symbols: set a letter with an index, such as a_f or θ_r^2, as the formula that it is meant to be.
+    """
+    if symbols:
+        pieces, end = [], 0
+        for found in _SYMBOLS.finditer(text):
+            pieces += [escape(text[end : found.start()], symbols=False), _symbol(*found.groups())]
+            end = found.end()
+        return "".join([*pieces, escape(text[end:], symbols=False)])
     pieces, end = [], 0
     for run in _RUNS.finditer(text):
         pieces.append(_plain(text[end : run.start()]))
@@ -61,6 +75,11 @@ def escape(text: str) -> str:
         body = raised.translate(_RAISED) if raised else run[2].translate(_LOWERED)
         pieces.append(rf"\ensuremath{{{'^' if raised else '_'}{{{body}}}}}")
     return "".join([*pieces, _plain(text[end:])])
+
+
+def _symbol(letter: str, index: str, power: str | None) -> str:
+    below = _plain(index) if len(index) == 1 else rf"\mathrm{{{index}}}"
+    return rf"\ensuremath{{{_plain(letter)}_{{{below}}}" + (f"^{{{power}}}}}" if power else "}")
 
 
 def _plain(text: str) -> str:

@@ -50,7 +50,7 @@ def thesis(experiments: Mapping[str, Mapping[str, Any]]) -> str:
 def _section(name: str, drawn: Mapping[str, Any]) -> str:
     parts = [
         rf"\clearpage\section{{{escape(drawn['title'])}}}",
-        f"{escape(drawn['shows'])} Made by \\texttt{{dsfit figures run {escape(name)}}}.",
+        f"{escape(drawn['shows'])} Made by \\texttt{{dsfit figures run {escape(name, symbols=False)}}}.",
         _reproduced(drawn["reproduces"]),
     ]
     parts += [_figure(name, figure, one["caption"]) for figure, one in drawn["figures"].items()]
@@ -65,7 +65,7 @@ def _reproduced(rules: Mapping[str, str]) -> str:
         by_rule.setdefault(rule, []).append(pattern)
     said = []
     for rule, patterns in by_rule.items():
-        names = ", ".join(rf"\texttt{{{escape(pattern)}}}" for pattern in patterns)
+        names = ", ".join(rf"\texttt{{{escape(pattern, symbols=False)}}}" for pattern in patterns)
         said.append(f"{names} {escape(rule)}")
     return "\\begin{sloppypar}Reproduced means: " + "; ".join([*said, "all else equal"]) + ".\\end{sloppypar}"
 

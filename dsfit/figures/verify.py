@@ -31,7 +31,13 @@ _MOST_TOLD = 20
 def verify_all(entries: Sequence[Entry], out: Path, against: Path) -> dict[str, dict[str, Any]]:
     """Compare each experiment, and write `OUT/verify.json`; returns what it holds: by experiment, the verdict
     ("agrees", "deviates", "not compared"), the reason if it was not compared, values by kind of rule, the worst
-    deviation in units of what is allowed and where it is, seconds' ratios, and what deviates."""
+    deviation in units of what is allowed and where it is, seconds' ratios, and what deviates.
+
+    Raises:
+        InputError: there is no directory `OUT`.
+    """
+    if not out.is_dir():
+        raise InputError(str(out), "no such directory", "a directory that `dsfit figures run` has written")
     found = {entry.name: verify(entry, out / entry.name, against / entry.name) for entry in entries}
     files.write_json(out / "verify.json", {"schema_version": SCHEMA_VERSION, "experiments": found})
     return found
