@@ -181,15 +181,10 @@ def _lit(arrays: Any, at: tuple[int, ...]) -> list[str]:
 
 
 def _others(arrays: Any, at: tuple[int, ...]) -> list[str]:
-    default = (
-        arrays["counts.bias"][at],
-        arrays["counts.exp"][at] - arrays["counts.zero"][at],
-        arrays["counts.brier_poisson"][at],
-    )
+    bias, v, zero, square = (arrays[f"counts.{name}"][at] for name in ("bias", "exp", "zero", "brier_poisson"))
     others = zip(*(arrays[f"others.{name}"][at] for name in ("bias", "exp_less_zero", "brier")), strict=True)
-    return [
-        f"{100 * bias:+.1f} %, {less:+.3f}, {square:.4f}" for bias, less, square in ((bias, v - zero, square), *others)
-    ]
+    treatments = [(bias, v - zero, square), *others]
+    return [f"{100 * shift:+.1f} %, {less:+.3f}, {error:.4f}" for shift, less, error in treatments]
 
 
 def _steps(arrays: Any, at: tuple[int, ...]) -> list[str]:

@@ -1,4 +1,4 @@
-"""The pieces of `experiments/throughput.py`: timing in turn, counting, which LLVM, limits, figure and table."""
+"""The experiment `throughput`: timing in turn, counting, which LLVM, limits, processes of its own, pictures, tables."""
 
 from __future__ import annotations
 
@@ -6,24 +6,22 @@ import importlib
 import math
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
+from dsfit.figures import Data, Work
+from dsfit.figures.catalogue import find
+from dsfit.figures.page import Page
 from dsfit.race.machine import probe
 
-FOLDER = Path(__file__).parents[2] / "experiments"
-
-
-@pytest.fixture(autouse=True)
-def scripts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(FOLDER))
+ROOT = Path(__file__).parents[2]
 
 
 def script(name: str) -> ModuleType:
-    return importlib.import_module(name)
+    return importlib.import_module(f"experiments.{name}")
 
 
 def test_contenders_run_in_turn_and_rows_are_what_they_took() -> None:
@@ -175,9 +173,7 @@ def _data() -> dict[str, Any]:
         rows.append(_row("kernel, compiled", "prepare", "all different", count, count / 1e6))
     limits = {"eager": {"exp": 1e9, "sqrt": 1e9, "multiply": 1e9}, "copy": {"memory": 1e10}, "matrix": 1e10}
     return {
-        "provenance": {"machine": {"processor": "a processor"}},
         "load": {"before": 0.5, "after": 1.5, "cores": 2},
-        "seconds": 12.0,
         "mitsuba": {"version": "3.9", "variant": "llvm_ad_rgb", "reason": "LLVM 19"},
         "rows": rows,
         "machine": {**limits, "compiled": {}, "gather": {"eager": {"8 MiB": 1e9}, "lines": {"8 MiB": 1e8}}},
@@ -187,20 +183,65 @@ def _data() -> dict[str, Any]:
 
 
 def test_table_has_medians_and_ratios() -> None:
-    text = script("_throughput_report").table(_data())
-    assert "| eval | Mitsuba 3 hair | all different | 40 (33.3-44.4) | 40 (33.3-44.4) |" in text
-    assert "| eval | kernel, compiled | all different | 60 (50-66.7) x1.50 | 60 (50-66.7) x1.50 |" in text
-    assert "| eval | kernel, compiled | 16 a context | 80 (66.7-88.9) x2.00 |" in text
-    assert "| prepare | all different | 1000.0 |" in text
+    tables = {table.name: table.markdown() for table in script("drawing.throughput").tables(Data(record=_data()))}
+    assert "| eval | Mitsuba 3 hair | all different | 40 (33.3-44.4) | 40 (33.3-44.4) |" in tables["rates"]
+    assert "| eval | kernel, compiled | all different | 60 (50-66.7) x1.50 | 60 (50-66.7) x1.50 |" in tables["rates"]
+    assert "| eval | kernel, compiled | 16 a context | 80 (66.7-88.9) x2.00 |" in tables["rates"]
+    assert "| prepare | all different | 1000.0 |" in tables["terms"]
+    assert "| eval | 12, 12 | 0, 0 | 8, 8 |" in tables["limits"]
 
 
-def test_figure_is_drawn_from_data_alone(tmp_path: Path) -> None:
-    paths = script("_throughput_report").figure(_data(), tmp_path)
-    assert [path.name for path in paths] == ["throughput.png", "throughput.pdf"]
-    assert all(path.stat().st_size > 5000 for path in paths)
+def test_pictures_are_drawn_from_data_alone() -> None:
+    assert set(_drawn(_data())) == {"rates", "directions", "ratios", "limits"}
 
 
-def test_scripts_do_not_load_mitsuba_when_imported() -> None:
+def test_without_mitsuba_there_is_no_comparison() -> None:
+    data = _data()
+    data["rows"] = [row for row in data["rows"] if row["library"] != "Mitsuba"]
+    data["mitsuba"] = {"version": "", "variant": None, "reason": "Mitsuba is not installed"}
+    assert set(_drawn(data)) == {"rates", "directions", "limits"}
+    caption = script("drawing.throughput").tables(Data(record=data))[0].caption
+    assert "Mitsuba is not installed" in caption
+
+
+def _drawn(record: dict[str, Any]) -> dict[str, Any]:
+    figures = script("drawing.throughput").figures(Data(record=record), Page(150.0))
+    for figure in figures.values():
+        figure.draw_without_rendering()
+    return figures
+
+
+def test_the_worker_has_the_threads_it_was_given(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The frame's own process is held to one thread; what it starts is not."""
+    throughput = script("throughput")
+    (tmp_path / "told.py").write_text(
+        "import json, os, sys\n"
+        "names = ('OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'OPENBLAS_NUM_THREADS')\n"
+        "print('measuring')\n"
+        "json.dump([os.environ[name] for name in names], open(sys.argv[2], 'w'))\n"
+    )
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.setattr(throughput, "worker", SimpleNamespace(__name__="told"))
+    said: list[str] = []
+    work = Work(tmp_path, tmp_path, said.append)
+    assert throughput.in_process({"threads": 2}, work) == ["2", "2", "2"] and said == ["measuring"]
+    (tmp_path / "told.py").write_text("raise SystemExit(3)")
+    with pytest.raises(RuntimeError, match="ended with 3"):
+        throughput.in_process({"threads": 2}, work)
+
+
+@pytest.mark.slow
+def test_a_small_run(tmp_path: Path) -> None:
+    throughput = script("throughput")
+    settings = find(ROOT, "throughput").settings((*throughput.EXPERIMENT.small, "counts=[1000]", "seconds=0.01"))
+    record = throughput.compute(settings, Work(tmp_path, ROOT, print)).record
+    assert {row["task"] for row in record["rows"]} >= {"eval", "log_prob", "sample", "fused", "prepare", "to_angles"}
+    assert {row["threads"] for row in record["rows"]} == {1}
+    assert set(record["counts"]) == {"prepare", "eval", "log_prob", "sample", "fused"}
+    assert ("Mitsuba" in {row["library"].split(",")[0] for row in record["rows"]}) == bool(record["mitsuba"]["variant"])
+
+
+def test_modules_do_not_load_mitsuba_when_imported() -> None:
     before = "mitsuba" in sys.modules
-    script("_throughput_mitsuba")
+    script("throughput")
     assert ("mitsuba" in sys.modules) == before
