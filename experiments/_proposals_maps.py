@@ -22,13 +22,12 @@ _PILOT = 4096
 
 @dataclass(frozen=True)
 class Map:
-    """Cells of one proposal `[24, 36]`: expected counts and counts; mass of the density and chi-square of the cells."""
+    """Cells of one proposal `[24, 36]`: expected counts and counts; mass of the density and p-value of chi-square."""
 
     expected: np.ndarray
     observed: np.ndarray
     mass: float
-    statistic: float
-    degrees: int
+    p_value: float
 
 
 def even_cells() -> CellGrid:
@@ -46,8 +45,7 @@ def measure(proposal: Proposal, context: Context, samples: int, seed: int) -> Ma
         mass = cell_masses(distribution, context, grid, [pilot], rtol=1e-5).mass
     total = float(mass.sum())
     expected = mass * (samples / total)
-    _, statistic, degrees = pooled_chi_square(observed, expected)
-    return Map(expected.numpy(), observed.numpy(), total, statistic, degrees)
+    return Map(expected.numpy(), observed.numpy(), total, pooled_chi_square(observed, expected)[0])
 
 
 def _drawn(distribution: Distribution, count: int, seed: int) -> Tensor:

@@ -25,7 +25,7 @@ def all_maps(data: Data, page: Page) -> Figure:
         f"counts of {data.record['map_samples']:,} samples, and their residual",
         fontsize=8,
     )
-    axes = figure.subplots(rows, 3 * _BLOCKS, sharex=True, sharey=True)
+    axes = figure.subplots(rows, 3 * _BLOCKS, sharex=True, sharey=True, squeeze=False)
     shades = matplotlib.colormaps["viridis"].with_extremes(bad="#ffffff", under="#ffffff")
     sky, gap = LogNorm(_DECADES, 1), Normalize(-_SPAN, _SPAN)
     for k in range(rows * _BLOCKS):
