@@ -1,5 +1,5 @@
-"""What the experiments on multiple importance sampling share: the integrand at one context with the chapter's proposals,
-and the relative variance of their combinations by quadrature."""
+"""What the experiments on multiple importance sampling share: the integrand at one context with the chapter's
+proposals, and the relative variance of their combinations by quadrature."""
 
 from __future__ import annotations
 
@@ -125,3 +125,19 @@ def median_seconds(work: Callable[[], Any], repeats: int) -> float:
     """Median CPU seconds of `work`, which has been done once before."""
     work()
     return statistics.median(timed(work)[1] for _ in range(repeats))
+
+
+Estimator = Callable[[int, torch.Generator], Tensor]
+"""Samples in all and a generator to an estimate `[C]`."""
+
+
+@torch.no_grad()
+def error_and_seconds(
+    estimator: Estimator, integral: Tensor, samples: int, repeats: int, seed: int
+) -> tuple[float, float, float]:
+    """Relative root mean squared error of one estimate, its standard error, and median CPU seconds."""
+    generator, found = torch.Generator().manual_seed(seed), []
+    seconds = median_seconds(lambda: found.append(estimator(samples, generator)), repeats)
+    squares = (torch.stack(found) - integral).square().sum(-1) / integral.square().sum()
+    root = float(squares.mean().sqrt())
+    return root, float(squares.std()) / (2 * root * len(squares) ** 0.5), seconds

@@ -96,8 +96,8 @@ def _contexts(settings: MisVariance, heuristics: dict[str, Any], work: Work) -> 
 
 
 def _seconds(settings: MisVariance, heuristics: dict[str, Any]) -> np.ndarray:
-    """CPU seconds per sample `[set, rule, model]` of `dsfit.estimate` without its tests, medians of repeats; they depend
-    on the proposals, hardly on the context."""
+    """CPU seconds per sample `[set, rule, model]` of `dsfit.estimate` without its tests, medians of repeats; they
+    depend on the proposals, hardly on the context."""
     spot = Spot(settings.presets[0], settings.theta_r_deg[0], settings.n[0])
     found = np.zeros((len(settings.sets), len(heuristics), len(MODELS)))
     for s, members in enumerate(settings.sets.values()):

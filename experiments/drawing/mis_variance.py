@@ -162,12 +162,13 @@ def _summary(data: Data) -> Table:
         f"Variance per sample with equal shares over that of multi-sample balance, by quadrature, over {len(ratios)} "
         "contexts: median, least, largest; wins: contexts where it is the least of its model, optimal left out, which "
         "is balance with control variates and not a weighting by densities alone. Efficiency: median of variance x CPU "
-        "time over that of balance, time as `dsfit.estimate` takes it, whose one-sample model draws in one batch and the "
-        "multi-sample model in one for each proposal. Measured variances, {record['repeats']} x {record['samples']} "
-        f"samples each, deviate from quadrature by {_rms(z_variance[:, :, plain]):.2f} standard errors in the root mean "
-        f"square (largest {np.abs(z_variance[:, :, plain]).max():.1f}), means by {_rms(z_mean):.2f} (largest "
-        f"{np.abs(z_mean).max():.1f}); measured variances of optimal lie {100 * _optimal_cost(data):.1f} % above quadrature "
-        "in the median: its control variates are estimated from the samples."
+        "time over that of balance, time as `dsfit.estimate` takes it, whose one-sample model draws in one batch and "
+        f"the multi-sample model in one for each proposal. Measured variances, {record['repeats']} x "
+        f"{record['samples']} "
+        f"samples each, deviate from quadrature by {_rms(z_variance[:, :, plain]):.2f} standard errors in the root "
+        f"mean square (largest {np.abs(z_variance[:, :, plain]).max():.1f}), means by {_rms(z_mean):.2f} (largest "
+        f"{np.abs(z_mean).max():.1f}); measured variances of optimal lie {100 * _optimal_cost(data):.1f} % above "
+        "quadrature in the median: its control variates are estimated from the samples."
     )
     head = ["proposals", "model", "heuristic", "median", "least", "largest", "wins", "efficiency, median"]
     return Table("heuristics", caption, head, rows, "lllrrrrr")
@@ -198,8 +199,9 @@ def _contexts(data: Data) -> Table:
             row += [f"{exact[r]:.3g}", f"{value[r]:.3g} ± {error[r]:.1g}"]
         rows.append([*row, names[best], f"{exact[best] / exact[0]:.3g}"])
     caption = (
-        f"N Var / |∫F|² of the multi-sample estimator with equal shares of the proposals “{record['set_names'][0]}”: by "
-        "quadrature, and measured with its standard error; the heuristic of least variance (optimal left out), and its "
+        f"N Var / |∫F|² of the multi-sample estimator with equal shares of the proposals “{record['set_names'][0]}”: "
+        "by quadrature, and measured with its standard error; the heuristic of least variance (optimal left out), "
+        "and its "
         "variance over that of balance."
     )
     head = ["fibre", "θ_r / °", "n", "balance", "measured", "maximum", "measured", "optimal", "measured", "least",
@@ -219,8 +221,9 @@ def _best_shares(data: Data) -> Table:
                 row += [f"{grid[best]:.2f}", f"{curve[best]:.3g}", f"{curve[middle]:.3g}"]
             rows.append([*row, *(f"{x:.3g}" for x in alone)])
     caption = (
-        f"Two proposals ({record['pair_preset']}, θ_r = {number(record['pair_theta_r_deg']):g}°): share of the first at "
-        f"which the variance N Var / |∫F|² is least (on a grid of {len(grid)}), that variance, and the one with equal "
+        f"Two proposals ({record['pair_preset']}, θ_r = {number(record['pair_theta_r_deg']):g}°): share of the first "
+        f"at which the variance N Var / |∫F|² is least (on a grid of {len(grid)}), that variance, and the one with "
+        "equal "
         "shares, for the multi-sample and the one-sample model; the variances of the first and of the second alone."
     )
     head = ["proposals", "heuristic", "best share", "least", "equal", "one-sample: best share", "least", "equal",
