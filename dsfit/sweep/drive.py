@@ -67,6 +67,7 @@ class Drive:
     _attempts: dict[int, int] = field(init=False, default_factory=dict)
     _mean: float | None = field(init=False, default=None)
     _unable: int = field(init=False, default=0)
+    _left: int = field(init=False, default=0)  # not handed out yet
 
     def run(self) -> Counts:
         """Compute every cell that the log does not have.
@@ -77,12 +78,13 @@ class Drive:
         done = self.log.done
         self.counts = Counts(len(done), int(done.sum()))
         todo = _missing(done)
-        remaining, flying = self.counts.total - self.counts.done, 0
+        self._left = remaining = self.counts.total - self.counts.done
+        flying = 0
         last_seen = time.monotonic()
         while remaining:
             slots = self.machines.slots()
             last_seen = time.monotonic() if slots else last_seen
-            while flying < IN_FLIGHT * slots and (tasks := self._next(todo, remaining, slots)):
+            while flying < IN_FLIGHT * slots and (tasks := self._next(todo, slots)):
                 self._submit(tasks)
                 flying += 1
             self.counts.most_in_flight = max(self.counts.most_in_flight, flying)
@@ -97,14 +99,16 @@ class Drive:
             self.tell(self.counts)
         return self.counts
 
-    def _next(self, todo: Iterator[int], remaining: int, slots: int) -> list[Task]:
+    def _next(self, todo: Iterator[int], slots: int) -> list[Task]:
         """The next batch: a cell that failed before is on its own, so that nothing else goes down with it."""
         if self._again:
             return [self._again.popleft()]
         size = 1
         if self._mean is not None:
-            size = max(1, min(_MOST, int(BATCH_SECONDS / max(self._mean, 1e-9)), math.ceil(remaining / (4 * slots))))
-        return [self.task_of(cell) for _, cell in zip(range(size), todo, strict=False)]
+            size = max(1, min(_MOST, int(BATCH_SECONDS / max(self._mean, 1e-9)), math.ceil(self._left / (4 * slots))))
+        tasks = [self.task_of(cell) for _, cell in zip(range(size), todo, strict=False)]
+        self._left -= len(tasks)
+        return tasks
 
     def _submit(self, tasks: list[Task]) -> None:
         future = self.machines.submit(Batch(self.base, tasks, numbers_version(), self.timeout))

@@ -16,6 +16,8 @@ from dsfit.sweep.slot import Batch, run_batch, start_again, stop_all
 
 # what decides numbers, and what has to understand each other over the network
 _COMPARED = ("torch", "numpy", "scipy", "jax", "optimistix", "distributed", "cloudpickle")
+CONNECT_SECONDS = 20.0
+"""How long a scheduler, and then its first worker, is waited for."""
 _ASK_EVERY = 5.0  # seconds between looks at how many workers there are
 
 
@@ -78,12 +80,12 @@ def versions() -> dict[str, str]:
 class DaskCluster:
     """The workers of a Dask scheduler: as many batches at once as they have threads. Workers may come and go."""
 
-    def __init__(self, address: str, timeout: float = 20.0) -> None:
+    def __init__(self, address: str, timeout: float | None = None) -> None:
         """Connect, and compare the versions of all workers with this process's.
 
         Args:
             address: of the scheduler, as `tcp://host:8786`, or the JSON file that it writes.
-            timeout: seconds to wait for the scheduler, and then for its first worker.
+            timeout: seconds to wait for the scheduler, and then for its first worker; left out, `CONNECT_SECONDS`.
 
         Raises:
             InputError: `distributed` is not installed, or nobody answers there.
@@ -93,6 +95,7 @@ class DaskCluster:
             from distributed import Client
         except ImportError:
             raise InputError("--dask", address, "the package `distributed` to be installed here and there") from None
+        timeout = CONNECT_SECONDS if timeout is None else timeout
         self._client = _connect(Client, address, timeout)
         self._executor = self._client.get_executor(pure=False)
         self._slots, self._asked = 0, -_ASK_EVERY

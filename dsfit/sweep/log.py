@@ -31,7 +31,8 @@ class CellLog:
         self._file = open(path, "a+b")  # noqa: SIM115  (open as long as the log is)
         self._synced = time.monotonic()
         self._end = self._read()
-        self._file.truncate(self._end)
+        if self._end < self._file.seek(0, os.SEEK_END):
+            self._file.truncate(self._end)
 
     def _read(self) -> int:
         """Find the lines; returns where the last whole one ends."""

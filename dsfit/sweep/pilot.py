@@ -12,7 +12,7 @@ from dsfit.experiment.provenance import numbers_version
 from dsfit.sweep.plan import Plan
 from dsfit.sweep.slot import Batch, run_batch, start_again, stop_all
 
-LINE_BYTES = 25  # of the log beside the JSON
+LINE_BYTES = 11  # of the log beside the JSON and the cell's number
 _PARQUET_SHARE = 0.5  # bytes of the table over those of the log's rows: measured, see the README
 
 
@@ -54,7 +54,7 @@ def pilot(plan: Plan, count: int, timeout: float | None = None) -> Estimate:
     finally:
         stop_all()
     seconds = [outcome["seconds"] for outcome in found]
-    sizes = [len(json.dumps(outcome, separators=(",", ":"))) + LINE_BYTES for outcome in found]
+    sizes = [len(json.dumps(outcome, separators=(",", ":"))) + LINE_BYTES + len(str(len(plan))) for outcome in found]
     rows = [len(outcome.get("rows", [0])) for outcome in found]
     failed = [f"cell {outcome['cell']}: {outcome['error']}" for outcome in found if "fate" in outcome]
     mean = float(np.mean(seconds))
