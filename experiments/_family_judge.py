@@ -38,7 +38,7 @@ def quantiles(excess: Any, unit: Any, levels: Any = tuple(LEVELS.values())) -> d
     for _ in range(_RESAMPLES):
         chosen = random.integers(len(parts), size=len(parts))
         drawn.append(np.quantile(np.concatenate([parts[k] for k in chosen]), level))
-    error = np.std(drawn, axis=0, ddof=1)
+    error = np.std(drawn, axis=0, ddof=1) if len(parts) > 1 else np.zeros(len(level))
     return {"log10": np.quantile(log, level), "log10_error": error, "worst": np.array(10 ** log.max())}
 
 

@@ -53,13 +53,15 @@ def by_quadrature(integrand: Integrand, start: nn.Module, context: Context, judg
 def by_samples(
     radiance: Any, start: nn.Module, context: Context, judge: Judge, seed: int, watched: bool, **options: Any
 ) -> list[tuple[int, float, float]]:
-    """One stochastic fit: evaluations, seconds and excess at its end, and if `watched` after every step before.
+    """One stochastic fit: evaluations, seconds and excess at its end, and if `watched` after every step before that.
     Judging does not count as the fit's time."""
     curve: list[tuple[int, float, float]] = []
     judging = 0.0
 
     def watch(progress: Any, proposal: nn.Module) -> None:
         nonlocal judging
+        if progress.step == 0:  # the start
+            return
         began = time.perf_counter()
         # these samples were only drawn: what the proposal is came from those before
         used = progress.evaluations - (progress.evaluations // (progress.step + 1))

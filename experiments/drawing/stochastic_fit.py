@@ -46,10 +46,10 @@ def _progress(data: Data, page: Page) -> Figure:
         marker, seen[preset] = MARKERS[seen[preset] % len(MARKERS)], seen[preset] + 1
         ratio = 10 ** arrays["gauss_newton.log10_excess"][k] / arrays["quadrature.excess"][i]
         for axis, key in zip(axes, ("evaluations", "seconds"), strict=True):
-            x = np.median(arrays[f"gauss_newton.{key}"][k], axis=0)[1:]
+            x = np.median(arrays[f"gauss_newton.{key}"][k], axis=0)
             label = _name(scenes[i]) if key == "evaluations" else None
-            axis.plot(x, np.median(ratio, axis=0)[1:], color=color, linestyle=line, linewidth=1.2, label=label)
-            axis.fill_between(x, ratio.min(0)[1:], ratio.max(0)[1:], color=color, alpha=0.1, linewidth=0)
+            axis.plot(x, np.median(ratio, axis=0), color=color, linestyle=line, linewidth=1.2, label=label)
+            axis.fill_between(x, ratio.min(0), ratio.max(0), color=color, alpha=0.1, linewidth=0)
             axis.plot(arrays[f"quadrature.{key}"][i], 1.0, marker, color=color, markersize=4.5, markeredgecolor="white")
     for axis, label in zip(axes, ("evaluations of the integrand", "seconds"), strict=True):
         axis.axhline(1.0, color="black", linewidth=0.8, zorder=0.5)
@@ -69,8 +69,8 @@ def _noise(data: Data, page: Page) -> Figure:
     for axis, i in zip(figure.subplots(1, max(len(noisy), 1), sharey=True, squeeze=False)[0], noisy, strict=False):
         for color, name in zip(COLORS, ("gauss_newton", "two_draws"), strict=False):
             k = list(arrays[f"{name}.scenes"]).index(i)
-            x = np.median(arrays[f"{name}.evaluations"][k], axis=0)[1:]
-            excess = 10 ** arrays[f"{name}.log10_excess"][k][:, 1:]
+            x = np.median(arrays[f"{name}.evaluations"][k], axis=0)
+            excess = 10 ** arrays[f"{name}.log10_excess"][k]
             answers = "one answer a sample" if name == "gauss_newton" else "two answers a sample"
             axis.plot(x, np.median(excess, axis=0), color=color, label=answers)
             axis.fill_between(x, excess.min(0), excess.max(0), color=color, alpha=0.15, linewidth=0)
