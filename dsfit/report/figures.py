@@ -23,7 +23,7 @@ TITLE = "Figures and tables"
 def figures_page(out: Path, place: Place, root: Path) -> Page:
     """The page of the whole set."""
     found = standings(out, root)
-    checked = verification(out)
+    checked = verification(out, {one.name: one.computed.get("data") for one in found})
     album = Album(place, sum(len(_pictures(one)) for one in found))
     sections = [Section("overview", "Overview", _overview(out, found, checked, place))]
     for k, one in enumerate(found):

@@ -20,9 +20,9 @@ MOST, LEAST = 900_000, 30_000
 """Bytes of one picture: no more than this even where it is the only one, and what it may always have."""
 _ENLARGED, _SCREEN = 1.2, 96.0
 _MOST_PIXELS = 80_000_000
-_WIDTHS = (2400, 1800, 1400, 1000, 700)
+_WIDTHS = (2400, 1800, 1400, 1000, 700, 500)
 _LONGEST = 16_000  # WebP ends at 16383 pixels
-_QUALITY = 88
+_QUALITIES = (88, 70)
 _FORMATS = {".pdf": "PDF", ".pgf": "PGF", ".exr": "EXR", ".tex": "TeX"}
 
 
@@ -104,24 +104,32 @@ def _smaller(image: Image, limit: int, before: int) -> tuple[str, str]:
     """WebP without loss if that is small enough, else with loss, and at last narrower."""
     packed = b""
     if max(image.size) <= _LONGEST:
-        packed = _webp(image, lossless=True)
+        packed = _webp(image, None)
         if len(packed) <= limit:
             return _uri("webp", packed), ""
     for width in (image.width, *(w for w in _WIDTHS if w < image.width)):
         height = max(1, round(image.height * width / image.width))
         if max(width, height) > _LONGEST:
             continue
-        packed = _webp(image if width == image.width else image.resize((width, height)), lossless=False)
-        if len(packed) <= limit:
-            break
+        narrow = image if width == image.width else image.resize((width, height))
+        for quality in _QUALITIES:
+            packed = _webp(narrow, quality)
+            if len(packed) <= limit:
+                return _uri("webp", packed), _note(before)
     if not packed:
         raise OSError(f"too long for a page: {image.width} x {image.height} pixels")
-    return _uri("webp", packed), f"compressed for this page; the file has {size(before)}"
+    return _uri("webp", packed), _note(before)
 
 
-def _webp(image: Image, lossless: bool) -> bytes:
+def _note(before: int) -> str:
+    return f"compressed for this page; the file has {size(before)}"
+
+
+def _webp(image: Image, quality: int | None) -> bytes:
+    """Without loss if no quality is given."""
     buffer = io.BytesIO()
-    image.save(buffer, "WEBP", lossless=lossless, quality=60 if lossless else _QUALITY, method=4)
+    options = {"lossless": True, "quality": 50, "method": 3} if quality is None else {"quality": quality, "method": 4}
+    image.save(buffer, "WEBP", **options)
     return buffer.getvalue()
 
 

@@ -51,14 +51,20 @@ class Verification:
         return blocks
 
 
-def verification(out: Path) -> Verification:
-    """What the directory's `verify.json` says; a damaged file is told of."""
+def verification(out: Path, data: Mapping[str, Any]) -> Verification:
+    """What the directory's `verify.json` says; a damaged file is told of.
+
+    Args:
+        out: the directory.
+        data: hashes of the present data, by experiment: what was compared when they were others counts no more.
+    """
     if not (out / "verify.json").exists():
         return Verification()
     try:
-        found = mapping(files.read_json(out / "verify.json", SCHEMA_VERSION).get("experiments"))
+        stored = mapping(files.read_json(out / "verify.json", SCHEMA_VERSION).get("experiments"))
     except InputError as error:
         return Verification(Verdict("unclear", "not verified", [f"verify.json: {error.value}."]))
+    found = {name: _present(mapping(one), data.get(name)) for name, one in stored.items()}
     states = {_state(mapping(one)) for one in found.values()}
     counts = Counter(_word(mapping(one)) for one in found.values())
     told = "Against stored data: " + ", ".join(f"{n} {word}" for word, n in sorted(counts.items())) + "."
@@ -67,6 +73,12 @@ def verification(out: Path) -> Verification:
     if "unclear" in states or not found:
         return Verification(Verdict("unclear", "not all compared", [told]), found)
     return Verification(Verdict("pass", "reproduced", [told]), found)
+
+
+def _present(one: Mapping[str, Any], data: Any) -> Mapping[str, Any]:
+    if one.get("verdict") != "agrees" or one.get("data") == data:
+        return one
+    return {"verdict": "not compared", "reason": "the data have changed since they were compared"}
 
 
 def _state(one: Mapping[str, Any]) -> State:

@@ -38,9 +38,9 @@ def write_report(folder: str | Path, out: str | Path | None = None, root: str | 
     """
     folder = Path(folder)
     path = folder / NAME if out is None else Path(out)
+    page = make_page(folder, Place(path), Path(root))
     if path.is_dir():
         raise InputError("--out", str(path), "a file")
-    page = make_page(folder, Place(path), Path(root))
     files.write_bytes(path, render(page).encode())
     return path
 
