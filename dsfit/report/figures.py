@@ -35,16 +35,15 @@ def figures_page(out: Path, place: Place, root: Path) -> Page:
     return Page("Figures by name", TITLE, verdict, _facts(found), sections)
 
 
-def _ordered(one: Standing, kind: str, suffix: str) -> list[Path]:
-    """Its figures or tables in the order in which they were drawn, those that are gone among them."""
-    drawn = [str(name) for name in mapping(one.drawn.get(kind)) if "/" not in str(name) and "\0" not in str(name)]
-    order = {name: k for k, name in enumerate(drawn)}
-    paths = {*one.folder.glob(f"{kind}/*{suffix}"), *(one.folder / kind / f"{name}{suffix}" for name in order)}
-    return sorted(paths, key=lambda path: (order.get(path.stem, len(order)), path.stem))
+def _files_of(one: Standing, kind: str, suffix: str) -> list[Path]:
+    """Its figures or tables by name, those that were drawn and are gone among them."""
+    drawn = [str(name) for name in mapping(one.drawn.get(kind))]
+    known = {one.folder / kind / f"{name}{suffix}" for name in drawn if "/" not in name and "\0" not in name}
+    return sorted(known | {*one.folder.glob(f"{kind}/*{suffix}")})
 
 
 def _pictures(one: Standing) -> list[Path]:
-    return _ordered(one, "figures", ".png")
+    return _files_of(one, "figures", ".png")
 
 
 def _verdict(found: list[Standing], checked: Verification) -> Verdict:
@@ -131,7 +130,7 @@ def _words(stem: str) -> str:
 
 def _tables(one: Standing, place: Place) -> list[Block]:
     found: list[Block] = []
-    for path in _ordered(one, "tables", ".md"):
+    for path in _files_of(one, "tables", ".md"):
         others = [path, path.with_suffix(".tex")]
         links = [place.link(p, {".md": "Markdown", ".tex": "LaTeX"}[p.suffix], " ") for p in others if p.is_file()]
         try:

@@ -40,7 +40,7 @@ azimuthal = "simplified"
 [contexts]
 theta_r_deg = [0, 30]
 [output]
-maps = 1
+maps = 0
 {_METHODS}{_ESTIMATE}
 """,
     "sweep": f"""

