@@ -21,7 +21,7 @@ from dsfit.figures import state
 from dsfit.figures.catalogue import Entry
 from dsfit.figures.make import Look, is_up_to_date
 from dsfit.figures.manifest import write_manifest
-from dsfit.figures.worker import DONE
+from dsfit.figures.worker import DONE, SAY
 
 _PATIENCE = 5.0
 
@@ -155,7 +155,7 @@ class _Crew:
             return Made(entry.name, f"{folder}: {error.strerror}")
 
     def _in_process(self, entry: Entry, folder: Path, handle: int) -> Made:
-        """Its last line is what it did; everything goes to the log."""
+        """Its last line is what it did, or why it failed; everything goes to the log, what is meant for it is told."""
         command = [sys.executable, "-m", "dsfit.figures.worker", self._job.text(entry)]
         log, last = folder / "log.txt", ""
         with open(log, "w", encoding="utf-8") as file:
@@ -164,7 +164,7 @@ class _Crew:
                     raise _Stopped
                 process = subprocess.Popen(
                     command, env={**os.environ, **ONE_THREAD}, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                    stderr=file, text=True, errors="replace", bufsize=1, start_new_session=True,
+                    stderr=subprocess.STDOUT, text=True, errors="replace", bufsize=1, start_new_session=True,
                     pass_fds=(handle,) if handle >= 0 else (),
                 )  # fmt: skip
                 self._running.add(process)
@@ -173,15 +173,15 @@ class _Crew:
             for line in process.stdout:
                 file.write(line)
                 file.flush()
-                last = line.strip()
-                if not last.startswith(DONE):
-                    self._job.say(entry.name, last)
+                last = line.strip() or last
+                if last.startswith(SAY):
+                    self._job.say(entry.name, last.removeprefix(SAY))
             code = process.wait()
             with self._guard:
                 self._running.discard(process)
         if code == 0 and last.startswith(DONE):
             return Made(entry.name, **json.loads(last.removeprefix(DONE)))
-        return Made(entry.name, f"{_ending(code)}: {_reason(log)} (all of it: {log})")
+        return Made(entry.name, f"{_ending(code)}: {last.removeprefix(SAY) or 'no word'} (all of it: {log})")
 
 
 class _Stopped(Exception):
@@ -212,8 +212,3 @@ def _ending(code: int) -> str:
         with contextlib.suppress(ValueError):
             return f"killed by {signal.Signals(-code).name}"
     return f"exit {code}"
-
-
-def _reason(log: Path) -> str:
-    lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
-    return lines[-1].strip() if lines else "no word"

@@ -1,4 +1,7 @@
-"""`python -m dsfit.figures.worker JOB`: makes one experiment and prints what it does, at last what it did, as JSON."""
+"""`python -m dsfit.figures.worker JOB`: makes one experiment and prints what it does, at last what it did, as JSON.
+
+Lines that begin with `say: ` are for whoever waits; whatever else libraries print is only for the log.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import json
 import sys
 from pathlib import Path
 
-DONE = "done: "
+DONE, SAY = "done: ", "say: "
 
 
 def main(text: str) -> None:
@@ -20,7 +23,7 @@ def main(text: str) -> None:
     job = json.loads(text)
     entry, look = find(job.pop("root"), job.pop("name")), Look(**job.pop("look"))
     out, overrides = Path(job.pop("out")), job.pop("overrides")
-    done = make(entry, out, overrides, say=lambda what: print(what, flush=True), look=look, **job)
+    done = make(entry, out, overrides, say=lambda what: print(f"{SAY}{what}", flush=True), look=look, **job)
     print(DONE + json.dumps(done), flush=True)
 
 
