@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import importlib.util
-import json
 import math
 import re
 from pathlib import Path
@@ -19,12 +17,14 @@ from dsfit.bsdf.conventions import Convention
 from dsfit.checks.controls import CONTROLS, TYPOS, parts, position, run, trial
 from dsfit.checks.controls.base import Control, Trial
 from dsfit.checks.controls.energy import energy_gap, outgoing_energy, remainder, smooth_bsdf
-from dsfit.checks.controls.scene import DEG, THETA_R, bsdf, context, integrand, nodes, terms
-from dsfit.checks.controls.table import HEADER, errata_table
+from dsfit.checks.controls.scene import DEG, SCENE, THETA_R, bsdf, context, integrand, nodes, terms
 from dsfit.checks.controls.transmittance import traced_lobes
 from dsfit.checks.finding import judge
 from dsfit.errors import InputError
+from dsfit.figures import Data
 from dsfit.frame import cos_inclination
+from experiments.drawing.errata import tables
+from experiments.errata import rows
 
 ROOT = Path(__file__).parents[2]
 # chi-square and z-score controls, whose corrected p-values are drawn anew with every seed
@@ -47,8 +47,14 @@ def readme_table() -> list[str]:
     return lines[start : end + 1]
 
 
+def table_of(effects: dict[str, str]) -> list[str]:
+    """Lines of the experiment's table with these effects."""
+    (table,) = tables(Data({}, {"scene": SCENE, "errata": rows(effects)}))
+    return [line for line in table.markdown().splitlines() if line.startswith("|")]
+
+
 def cells_of(line: str) -> list[str]:
-    return [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+    return [cell.strip().replace("`", "") for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
 
 
 def numbers_of(text: str) -> list[float]:
@@ -65,7 +71,7 @@ def test_printed_form_is_rejected_and_corrected_form_passes(name: str) -> None:
     assert [verdict for _, verdict in judge(CONTROLS[name].findings(swapped), 0.001)] == ["fail", "fail"]
     # and the README's row is this control, with these numbers
     row = next(line for line in readme_table() if f"(`{name}`)" in line)
-    wanted = next(line for line in errata_table({name: found.effect}).splitlines() if f"(`{name}`)" in line)
+    wanted = next(line for line in table_of({name: found.effect}) if f"({name})" in line)
     for column, (written, measured) in enumerate(zip(cells_of(row), cells_of(wanted), strict=True)):
         if column != 3:
             assert written == measured
@@ -77,9 +83,9 @@ def test_printed_form_is_rejected_and_corrected_form_passes(name: str) -> None:
 
 def test_readme_has_every_erratum_and_no_other() -> None:
     lines = readme_table()
-    wanted = errata_table(dict.fromkeys(CONTROLS, "")).splitlines()
-    assert lines[0] == wanted[0] and "\n".join(lines[2:4]) == HEADER
-    assert [cells_of(line)[:3] for line in lines[4:]] == [cells_of(line)[:3] for line in wanted[4:]]
+    wanted = table_of(dict.fromkeys(CONTROLS, ""))
+    assert lines[0].startswith(f"Measured in: {SCENE}") and cells_of(lines[2]) == cells_of(wanted[0])
+    assert [cells_of(line)[:3] for line in lines[4:]] == [cells_of(line)[:3] for line in wanted[2:]]
     assert len(lines) == 4 + len(CONTROLS) + len(TYPOS)
 
 
@@ -185,23 +191,6 @@ def test_traced_rays_carry_the_energies() -> None:
     for count, share in zip(counts, (0.0750, 0.8618, 0.0557), strict=True):
         assert abs(count / rays - share) < 5 * math.sqrt(share / rays) + 5e-5
     assert traced_lobes(0.1, rays, 3)[1] / rays == pytest.approx(0.7152662947, abs=5 * math.sqrt(0.2 / rays))
-
-
-def load_script() -> object:
-    spec = importlib.util.spec_from_file_location("errata_script", ROOT / "experiments" / "errata.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_script_reads_a_finished_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    findings = [f.to_dict() for f in run("cosine_cdf", seed=1).findings]
-    (tmp_path / "result.json").write_text(json.dumps({"cells": [{"findings": findings}]}))
-    load_script().main([str(tmp_path)])  # type: ignore[attr-defined]
-    table = capsys.readouterr().out
-    assert "P(π) = 4" in table and "`cosine_cdf`" in table and "`clamp`" not in table
-    assert sum(line.startswith("|") for line in table.splitlines()) == 2 + 1 + len(TYPOS)
 
 
 def test_figure_has_a_row_for_every_control() -> None:

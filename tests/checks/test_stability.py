@@ -16,7 +16,6 @@ from dsfit.checks.finding import Finding
 from dsfit.checks.stability import CLASSES, Function, atlas, findings, measure, parts, run
 from dsfit.checks.stability.function import class_of
 from dsfit.checks.stability.measure import rounded
-from dsfit.checks.stability.table import atlas_table, class_table
 from dsfit.context import Context
 from dsfit.errors import InputError
 from dsfit.mis.heuristics import Balance, Cutoff, Maximum
@@ -217,22 +216,6 @@ def test_an_exact_zero_among_uniforms_moves_no_other() -> None:
     eps = torch.finfo(torch.float32).eps
     assert moved[0].tolist() == u[0].tolist()
     assert moved[1, 2] == eps / 4 and moved[2, 1] == 1 - eps / 2 and moved.dtype == torch.float32
-
-
-def test_table_has_a_row_for_every_function() -> None:
-    found = [f.to_dict() for name in ("mis.balance", "cosine_azimuth.sample") for f in run(name, seed=1).findings]
-    lines = atlas_table(found).splitlines()
-    assert len(lines) == 4 and lines[2].startswith("| `mis.balance` |") and "nan" not in lines[2]
-
-
-def test_the_table_of_regimes_names_the_worst() -> None:
-    found = [f.to_dict() for name in ("mis.balance", "mis.power") for f in run(name, seed=1).findings]
-    wanted = {"class": "tail", "dtype": "float64", "quantity": "value"}
-    mine = [f for f in found if wanted.items() <= f["data"].items()]
-    mine[-1]["value"] = 0.5
-    (row,) = (line for line in class_table(found).splitlines() if line.startswith("| tail:"))
-    assert f"5.0e-01 `{mine[-1]['subject']}`" in row
-    assert "| dark: strong absorption; a_f near 0 |  |  |  |  |" in class_table(found)
 
 
 def test_maps_show_faults_and_limits() -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from dsfit.checks.finding import Finding
 from dsfit.checks.stiff_fits.cases import Case, Limits
-from dsfit.checks.stiff_fits.compare import compare, markdown
+from dsfit.checks.stiff_fits.compare import compare
 from dsfit.checks.stiff_fits.examine import Examination, able, examine
 from dsfit.checks.stiff_fits.fits import FITS
 from dsfit.checks.stiff_fits.liars import LIARS, LIMITS, SOLVER, caught, honest_case, is_caught
@@ -27,7 +27,7 @@ from dsfit.checks.subject import Outcome, Say, silent
 from dsfit.checks.suites import chosen
 from dsfit.fit.solvers import SOLVERS
 
-__all__ = ["PROBLEMS", "Examination", "Limits", "compare", "examine", "examine_all", "markdown", "parts", "run"]
+__all__ = ["PROBLEMS", "Examination", "Limits", "compare", "examine", "examine_all", "parts", "run"]
 
 PROBLEMS: dict[str, Callable[[], list[Case]]] = {**TOYS, **FITS}
 """Problems by name; each makes its cases, one per objective."""

@@ -49,17 +49,3 @@ def compare(findings: Iterable[Mapping[str, Any]]) -> list[Row]:
             )
         )
     return sorted(rows, key=lambda row: (-row.solved, row.seconds))
-
-
-def markdown(rows: Iterable[Row]) -> str:
-    """The rows as a table."""
-    lines = [
-        "| solver | problems | solved | converged | faults | evaluations | seconds |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {row.solver} | {row.problems} | {row.solved:.0%} | {row.converged:.0%} | {row.faulty:.0%} "
-        f"| {row.evaluations:.0f} | {row.seconds:.2f} |"
-        for row in rows
-    ]
-    return "\n".join(lines)
