@@ -61,7 +61,7 @@ def test_an_experiment_has_figures_tables_command_rules_and_latex(experiments: E
     latex = folds["LaTeX"][0]
     assert isinstance(latex, Code)
     assert r"\includegraphics[width=\linewidth]{page_made/figures/second.pdf}" in latex.text
-    assert r"\input{page_made/tables/numbers.tex}" in latex.text and r"What page\_made shows, a\_f" in latex.text
+    assert r"\input{page_made/tables/numbers.tex}" in latex.text and r"What page\_made shows, " in latex.text
     other = section(page, "page_other <i>and</i> more").blocks
     assert [block.text for block in other if isinstance(block, Code)] == ["dsfit figures run page_other --set n=4"]
 
