@@ -172,6 +172,7 @@ EXPERIMENT = Experiment(
     },
     small=(
         "samples=96", "repeats=6", "growth=[64]", "shares=5", "timed_samples=[64]", "timed_repeats=3",
+        'contexts=[{preset="blond", theta_r_deg=0.0, n=0.0}]',
         'order=["transmittance_gaussian", "uniform", "M_TRT", "R"]', "timed_proposals=3",
     ),
 )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ def test_shapes_are_those_of_the_components(setting: Setting) -> None:
     start = structured_start(setting.integrand, setting.context)
     shapes = fitted_shapes(start)
     lobe = start.components[start.names.index("TT")].longitudinal
-    values = [float(np.degrees(getattr(lobe, key)().detach())) for key in ("mode", "below", "above")]
+    values = [math.degrees(float(getattr(lobe, key)().detach())) for key in ("mode", "below", "above")]
     assert shapes[GROUPS.index("TT")] == pytest.approx(values)
     assert (shapes[:, 1:] > 0).all()
 
