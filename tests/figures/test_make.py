@@ -126,9 +126,8 @@ TINY = """
 theta_r_deg = [0.0]
 n = [0]
 [[methods]]
-kind = "single"
 name = "uniform"
-proposals = ["uniform"]
+kind = "uniform"
 [estimate]
 samples = [16]
 repeats = 2
