@@ -34,6 +34,7 @@ def seconds(value: float) -> str:
         return f"{value / 60:.3g} min"
     if value >= 7200:
         return f"{value / 86400:.3g} days" if value >= 172800 else f"{value / 3600:.3g} h"
+    value = float(f"{value:.3g}")  # 999.9 ms are 1 s, not 1e+03 ms
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
         if value >= size:
             return f"{value / size:.3g} {unit}"

@@ -101,8 +101,8 @@ def _measured(axis: Axes, data: Data, name: str, context: int | None, color: str
     """What was measured; bars are standard errors, or the middle 80 % of the contexts."""
     error, bars, time = (data.arrays[f"{key}.{name}"] for key in ("rmse", "rmse_error", "time"))
     if context is None:
-        middle, ends = np.median(error, axis=0), np.quantile(error, (0.1, 0.9), axis=0)
-        x = np.median(time[..., 1], axis=0)
+        middle, ends = np.nanmedian(error, axis=0), np.nanquantile(error, (0.1, 0.9), axis=0)
+        x = np.nanmedian(time[..., 1], axis=0)
         across = np.stack([middle - ends[0], ends[1] - middle])
     else:
         middle, x = error[context], time[context, :, 1]
@@ -137,12 +137,12 @@ def _limits(data: Data, names: list[str]) -> tuple[float, float, float, float]:
     times = [arrays[f"time.{name}"] for name in names]
     errors = np.concatenate([np.ravel(arrays[f"rmse.{name}"]) for name in names])
     fits = [float(np.nanmax(arrays[f"fit_time.{name}"])) for name in names if _fitted(data, name)]
-    right = max(float(max(t.max() for t in times)), 10 * max(fits, default=0.0))
+    right = max(float(max(np.nanmax(t) for t in times)), 10 * max(fits, default=0.0))
     return (
-        float(min(t.min() for t in times)) / 1.6,
+        float(min(np.nanmin(t) for t in times)) / 1.6,
         right,
-        max(float(errors.min()) / 2, 1e-5),
-        min(float(errors.max()) * 2, 3.0),
+        max(float(np.nanmin(errors)) / 2, 1e-5),
+        min(float(np.nanmax(errors)) * 2, 3.0),
     )
 
 
