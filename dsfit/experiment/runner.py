@@ -20,14 +20,8 @@ from dsfit.experiment import check_report, files, provenance
 from dsfit.experiment.cells import Job, jobs, run_job
 from dsfit.experiment.rundir import RunDirectory, RunFailure
 from dsfit.experiment.schema import SCHEMA_VERSION, Config
+from dsfit.experiment.threads import ONE_THREAD
 from dsfit.experiment.validation import Experiment
-
-ONE_THREAD = {
-    "OMP_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
-}
 
 
 class Progress(Protocol):

@@ -10,8 +10,8 @@ from typing import Any
 
 from dsfit.experiment.cells import Job, compute_job, label_of, work_of
 from dsfit.experiment.schema import Config
-from dsfit.sweep.plan import Base, Task
 from dsfit.sweep.rows import context_of, rows
+from dsfit.sweep.tasks import Base, Task
 
 Outcome = dict[str, Any]
 """`cell`, `seconds`, `context`, and either `rows` or `fate` ("raised", "timed out", "died"), `error`, `traceback`."""

@@ -16,8 +16,8 @@ from dsfit.experiment.provenance import numbers_version
 from dsfit.experiment.rundir import RunFailure
 from dsfit.sweep.executors import Machines
 from dsfit.sweep.log import CellLog
-from dsfit.sweep.plan import Base, Task
-from dsfit.sweep.slot import Batch, Stopped, Unable
+from dsfit.sweep.slot import Stopped, Unable
+from dsfit.sweep.tasks import Base, Batch, Task
 
 IN_FLIGHT = 3
 """Batches handed out per worker thread."""
@@ -111,7 +111,10 @@ class Drive:
         return tasks
 
     def _submit(self, tasks: list[Task]) -> None:
-        future = self.machines.submit(Batch(self.base, tasks, numbers_version(), self.timeout))
+        try:
+            future = self.machines.submit(Batch(self.base, tasks, numbers_version(), self.timeout))
+        except Exception as error:  # whatever a connection that is breaking raises
+            raise RunFailure(f"{self.machines.name}: {type(error).__name__}: {error}") from None
         future.add_done_callback(lambda done: self._arrived.put((tasks, done)))
 
     def _check(self, last_seen: float) -> None:

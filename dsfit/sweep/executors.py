@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from dsfit.errors import InputError
-from dsfit.experiment.provenance import numbers_version
+from dsfit.experiment.provenance import code_version
 from dsfit.experiment.rundir import RunFailure
-from dsfit.sweep.slot import Batch, run_batch, start_again, stop_all
+from dsfit.sweep.slot import run_batch, start_again, stop_all
+from dsfit.sweep.tasks import Batch
 
 # what decides numbers, and what has to understand each other over the network
 _COMPARED = ("torch", "numpy", "scipy", "jax", "optimistix", "distributed", "cloudpickle")
@@ -68,7 +69,7 @@ class LocalProcesses:
 
 def versions() -> dict[str, str]:
     """Versions of this process's code, Python and packages."""
-    found = {"dsfit": numbers_version(), "python": platform.python_version()}
+    found = {"dsfit": code_version(), "python": platform.python_version()}
     for name in _COMPARED:
         try:
             found[name] = importlib.metadata.version(name)

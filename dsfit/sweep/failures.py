@@ -14,7 +14,8 @@ from dsfit.experiment import files
 from dsfit.experiment.design import at_point
 from dsfit.sweep.compute import work_at
 from dsfit.sweep.log import CellLog
-from dsfit.sweep.plan import Base, Plan, Task
+from dsfit.sweep.plan import Plan
+from dsfit.sweep.tasks import Base, Task
 
 MOST = 1000
 """So many failures get files of their own; all are in the log and the table."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,46 +12,18 @@ from typing import Any
 import numpy as np
 
 from dsfit.experiment.cells import work_of
-from dsfit.experiment.design import Design, at_point, design_of
+from dsfit.experiment.design import Choices, Design, design_of
 from dsfit.experiment.reader import RawConfig
 from dsfit.experiment.schema import Config
-from dsfit.experiment.validation import load_base, validate
+from dsfit.experiment.validation import load_base
+from dsfit.sweep.tasks import Base, Task
 
 KINDS = ("compare", "sweep", "transmittance", "amortise", "check")
 MAX_CELLS = 10_000_000
 VALIDATED = 10_000
 """Points beyond this many are validated when their turn comes; before the start, this many spread over all of them."""
-
-
-@dataclass(frozen=True)
-class Base:
-    """What all cells of a sweep share, in plain data; it travels to workers.
-
-    Attributes:
-        raw: the tables, without the sweep.
-        sources: where the values of each key of the design were written.
-    """
-
-    raw: RawConfig
-    sources: dict[str, str]
-
-    def config(self, values: dict[str, Any]) -> Config:
-        """The config with these values.
-
-        Raises:
-            ConfigError: they are not allowed.
-        """
-        return validate(at_point(self.raw, self.sources, values))
-
-
-@dataclass(frozen=True)
-class Task:
-    """One cell as a worker gets it: its number, its point's number and values, and which of the point's cells it is."""
-
-    cell: int
-    point: int
-    values: dict[str, Any]
-    part: int
+SENT_BYTES = 2**20
+"""Files up to this size that the config names are sent to the workers; larger ones have to be there."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +86,21 @@ def _base(raw: RawConfig, design: Design) -> Base:
     shared.data.pop("sweep")
     if shared.data.get("kind") == "sweep":
         shared.data["kind"] = "compare"
-    return Base(shared, design.sources)
+    return Base(shared, design.sources, dict(_files([shared.data, design.grid, design.space])))
+
+
+def _files(node: Any) -> Iterator[tuple[str, bytes]]:
+    """Files that the tables or the design name, as far as they are small; their paths are absolute by now."""
+    if isinstance(node, Choices):
+        node = node.values
+    if isinstance(node, dict | list):
+        for value in node.values() if isinstance(node, dict) else node:
+            yield from _files(value)
+    elif isinstance(node, str) and os.path.isabs(node):
+        path, colon, _ = node.rpartition(":")
+        for name in {node, path} if colon else {node}:
+            if os.path.isfile(name) and os.path.getsize(name) <= SENT_BYTES:
+                yield name, Path(name).read_bytes()
 
 
 def _counts(base: Base, design: Design, say: Callable[[int, int], None]) -> np.ndarray:

@@ -13,13 +13,12 @@ import sys
 import tempfile
 import threading
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from dsfit.experiment.provenance import numbers_version
-from dsfit.experiment.runner import ONE_THREAD
-from dsfit.sweep.plan import Base, Task
+from dsfit.experiment.threads import ONE_THREAD
+from dsfit.sweep.tasks import Base, Batch, Task
 
 _SHOWN = 2000  # bytes of a dead child's last words
 
@@ -30,23 +29,6 @@ class Stopped(RuntimeError):
 
 class Unable(RuntimeError):
     """This worker cannot compute cells at all: another version of the code, or a child that does not start."""
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Cells that are computed one after another.
-
-    Attributes:
-        base: what they share.
-        tasks: the cells.
-        version: `numbers_version()` of the code that numbers have to come from.
-        timeout: seconds after which a cell is given up, or None.
-    """
-
-    base: Base
-    tasks: list[Task]
-    version: str
-    timeout: float | None = None
 
 
 _mine = threading.local()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,12 +38,14 @@ def markdown(record: dict[str, Any], table: Path, design: Design) -> str:
     ]
     for key in design.keys:
         data = pq.read_table(table, columns=[key, group, "status", *measures])
-        good = np.array(data["status"].to_pylist(), dtype=object) == "ok"
-        names = np.array([str(x) for x in data[group].to_pylist()], dtype=object)
+        names, status = _codes(data[group]), _codes(data["status"])
+        good = status.numbers == status.labels.index("ok") if "ok" in status.labels else np.zeros(len(data), bool)
         numbers = {m: data[m].to_numpy(zero_copy_only=False).astype(float) for m in measures}
         for label, here in _parts(data[key], design.space.get(key)):
-            for name in dict.fromkeys(names[good & here].tolist()):
-                chosen = good & here & (names == name)
+            for code, name in enumerate(names.labels):
+                chosen = good & here & (names.numbers == code)
+                if not chosen.any():
+                    continue
                 cells = [_short(_median(numbers[m][chosen])) for m in measures]
                 lines.append(f"| {key} | {label} | {name} | {int(chosen.sum())} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
@@ -57,11 +59,29 @@ def _parts(column: Any, axis: Any) -> list[tuple[str, np.ndarray]]:
         edges = cut(axis.low, axis.high, _BINS + 1)
         which = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, _BINS - 1)
         return [(f"{edges[k]:.4g} to {edges[k + 1]:.4g}", which == k) for k in range(_BINS)]
-    found = column.to_pylist()
-    texts = np.array([str(value) for value in found], dtype=object)
-    order = sorted(found) if isinstance(axis, Range) else found
-    shown = list(dict.fromkeys(map(str, order)))[:_MOST_VALUES]
-    return [(text, texts == text) for text in shown]
+    found = _codes(column)
+    order = list(range(len(found.labels)))
+    if isinstance(axis, Range):
+        order.sort(key=lambda code: int(found.labels[code]))
+    return [(found.labels[code], found.numbers == code) for code in order[:_MOST_VALUES]]
+
+
+class _Codes(NamedTuple):
+    """A column as whole numbers and what they stand for, in the order of their first appearance."""
+
+    numbers: np.ndarray
+    labels: list[str]
+
+
+def _codes(column: Any) -> _Codes:
+    import pyarrow as pa
+
+    if pa.types.is_list(column.type):
+        column = pa.chunked_array([pa.array([str(x) for x in chunk.to_pylist()]) for chunk in column.chunks])
+    encoded = column.combine_chunks().dictionary_encode()
+    return _Codes(
+        encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False), [str(x) for x in encoded.dictionary.to_pylist()]
+    )
 
 
 def _median(values: np.ndarray) -> float:

@@ -22,7 +22,7 @@ from dsfit.sweep.rows import CONTEXT, columns
 if TYPE_CHECKING:
     import pyarrow
 
-_PIECE = 20_000  # rows held at a time
+_PIECE = 10_000  # rows held at a time
 
 
 def require_parquet() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas
 
-from dsfit.sweep.slot import Batch
+from dsfit.sweep.tasks import Batch
 
 SCENE = """
 kind = "check"

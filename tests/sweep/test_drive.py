@@ -16,8 +16,8 @@ from dsfit.experiment.rundir import RunFailure
 from dsfit.sweep.drive import IN_FLIGHT, Drive
 from dsfit.sweep.executors import Machines
 from dsfit.sweep.log import CellLog
-from dsfit.sweep.plan import Base, Task
-from dsfit.sweep.slot import Batch, Unable
+from dsfit.sweep.slot import Unable
+from dsfit.sweep.tasks import Base, Batch, Task
 from tests.sweep.cheap import FakeMachines, rows_of
 
 BASE = Base(RawConfig("a", "a.toml", {}), {})

@@ -27,7 +27,8 @@ from dsfit.sweep.failures import reproducing, write_failures
 from dsfit.sweep.log import CellLog
 from dsfit.sweep.plan import make_plan
 from dsfit.sweep.run import read_record, run_sweep, sweep_directory
-from dsfit.sweep.slot import Batch, Unable, run_batch, start_again, stop_all
+from dsfit.sweep.slot import Unable, run_batch, start_again, stop_all
+from dsfit.sweep.tasks import Batch
 from tests.sweep.cheap import SCENE, SOBOL, config, measured
 
 ROOT = Path(__file__).resolve().parents[2]

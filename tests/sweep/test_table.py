@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,14 @@ from dsfit.errors import InputError
 from dsfit.experiment import files
 from dsfit.experiment.cells import jobs
 from dsfit.experiment.validation import load
-from dsfit.sweep import pilot, table
+from dsfit.sweep import pilot, table, tasks
+from dsfit.sweep.compute import compute
 from dsfit.sweep.failures import reproducing
 from dsfit.sweep.log import CellLog
 from dsfit.sweep.plan import make_plan
 from dsfit.sweep.run import run_sweep, sweep_directory
 from dsfit.sweep.table import write_table
-from tests.sweep.cheap import SOBOL, FakeMachines, config, measured, rows_of
+from tests.sweep.cheap import SCENE, SOBOL, FakeMachines, config, measured, rows_of
 
 
 def answer(batch: Any) -> list[dict[str, Any]]:
@@ -126,6 +128,20 @@ def test_a_finished_sweep_is_left_alone_and_a_failed_one_tried_again(tmp_path: P
     forced = run_sweep(plan, path, lambda: FakeMachines(lambda b: [rows_of(t.cell) for t in b.tasks]), force=True)
     assert forced["sessions"][0]["cells_reused"] == 0 and len(forced["sessions"]) == 1
     assert len(measured(path)) == 24
+
+
+def test_files_that_the_config_names_reach_workers_that_do_not_have_them(tmp_path: Path) -> None:
+    user = tmp_path / "mine.py"
+    user.write_text("from dsfit.proposals import UniformSphere\n\ndef proposal(*_):\n    return UniformSphere()\n")
+    scene = SCENE.replace('proposals = ["uniform"]', 'proposals = ["uniform"]\nuser = ["mine.py:proposal"]')
+    plan = make_plan(config(tmp_path, scene=scene))
+    here = compute(plan.base, plan.task(2))
+    assert list(plan.base.files) == [str(user)] and len(here["rows"]) == 4
+    user.unlink()
+    again = pickle.loads(pickle.dumps((plan.base, plan.task(2))))
+    tasks._place.cache_clear()
+    there = compute(*again)
+    assert there.get("error") is None and there["rows"] == here["rows"]
 
 
 def test_the_id_follows_the_design(tmp_path: Path) -> None:
