@@ -11,6 +11,7 @@ from dsfit.report.page import Block, Heading, Link, Table, Text
 MOST_ROWS = 1000
 """Rows of a table that a page shows."""
 
+_SENTENCE = 30  # what is longer is no number, whatever the rule says of its column
 _RULE = re.compile(r":?-+:?")
 _PIPE = re.compile(r"(?<!\\)\|")
 _NUMBER = re.compile(r"[~<>≤≥±+\-−]?(\d[\d.,]*([eE][+-]?\d+)?|inf|nan)?\s?[%×°a-zµ]{0,4}")
@@ -99,6 +100,8 @@ def parse_table(lines: Sequence[str]) -> tuple[list[str], list[list[str]], str]:
 
 
 def _letter(mark: str, cells: list[str], first: bool) -> str:
+    if any(len(cell) > _SENTENCE for cell in cells):
+        return "l"
     if mark.endswith(":"):
         return "c" if mark.startswith(":") else "r"
     given = [cell for cell in cells if cell not in ("", "-")]
