@@ -187,7 +187,7 @@ EXPERIMENT = Experiment(
         "*.map.*": Measured(),
     },
     small=(
-        'scenes=["block_blond_constant", "ball_black_studio"]',
+        'scenes=["block_blond_constant"]',
         "scale=0.3",
         "seconds=0.05",
         "reference_samples=16",

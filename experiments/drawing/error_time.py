@@ -64,9 +64,9 @@ def _error_time(data: Data, page: Page) -> Figure:
     chosen = [labels.index(label) for label in data.record["panels"] if label in labels] or spread(len(labels), 1)
     chosen = chosen[:_PANELS]
     figure = page.figure(1.0 if len(chosen) > 1 else 0.62)
-    axes = figure.subplots(2 if len(chosen) > 1 else 1, 2, sharex=True, sharey=True, squeeze=False)
+    axes = figure.subplots(2 if len(chosen) > 1 else 1, 1 + (len(labels) > 1), sharex=True, sharey=True, squeeze=False)
     limits = _limits(data, names)
-    groups = [(f"median of {len(labels)} contexts", None), *((labels[k], k) for k in chosen)]
+    groups = [(f"median of {len(labels)} contexts", None), *((labels[k], k) for k in chosen)][len(labels) == 1 :]
     for axis, (title, context) in zip(axes.flat, groups, strict=False):
         _panel(axis, data, names, context, limits)
         axis.set_title(title)

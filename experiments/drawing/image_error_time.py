@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from dsfit.experiment.compare_render_curve import Time
 from dsfit.experiment.plots.style import COLORS
@@ -102,6 +102,8 @@ def _panel(axis: Axes, data: Data, scene: dict[str, Any]) -> None:
     axis.set_ylim(min(low, own / 1.5), min(high, 10.0))
     axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     axis.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{100 * y:g} %"))
+    for way in (axis.xaxis, axis.yaxis):
+        way.set_minor_formatter(NullFormatter())
     axis.tick_params(labelsize=7)
     axis.grid(True)
 

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from dsfit.experiment.plots.style import COLORS
 from dsfit.experiment.race_report import seconds
@@ -110,6 +110,8 @@ def _panel(axis: Axes, peers: list[Entrant], named: list[str], group: str, count
         axis.set_xlim(ends[0] / 1.5, ends[1] * 1.5)
     axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"1e{round(math.log10(x))}" if x > 0 else ""))
     axis.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{100 * y:g} %"))
+    for way in (axis.xaxis, axis.yaxis):
+        way.set_minor_formatter(NullFormatter())
 
 
 def _points(peer: Entrant, group: str, counted: bool) -> tuple[np.ndarray, np.ndarray, list[np.ndarray] | None]:

@@ -40,6 +40,20 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
     return drawn
 
 
+def captions(data: Data) -> dict[str, str]:
+    """What the figures show."""
+    worst = "Worst relative error against 50-digit arithmetic, by class of regimes"
+    return {
+        "families": f"{worst}: all functions of a family together (how many).",
+        **{f"atlas_{dtype}": f"{worst}: every function in {dtype}, value and gradient." for dtype in _DTYPES},
+        **{
+            f"naive_{dtype}": f"{worst}: values in {dtype}, and those of the formula as one would write it down first."
+            for dtype in _DTYPES
+            if not np.isnan(data.arrays[f"naive.{dtype}.value"]).all()
+        },
+    }
+
+
 class _Grid:
     """Worst error, fault and verdict of each row and class of regimes."""
 

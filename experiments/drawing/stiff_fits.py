@@ -16,7 +16,7 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
     """A row per problem and objective, a column per solver, coloured by what is left of the way to the best value."""
     left, converged, faults = (data.arrays[key] for key in ("left", "converged", "faults"))
     problems, solvers = data.record["problems"], data.record["solvers"]
-    figure = page.figure(0.3 + 0.026 * len(problems))
+    figure = page.figure(max(0.3 + 0.026 * len(problems), 0.5))
     axes = figure.subplots()
     image = axes.imshow(left, aspect="auto", cmap="viridis_r", vmin=-_DECADES, vmax=0, interpolation="none")
     for row, column in zip(*np.nonzero(~np.isnan(left)), strict=True):
@@ -40,6 +40,14 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
     gap.set_label("not tried")
     figure.legend(handles=[dot, cross, gap], loc="outside lower center", ncols=3, frameon=False)
     return {"stiff_fits": figure}
+
+
+def captions(data: Data) -> dict[str, str]:
+    """What the figure shows."""
+    return {
+        "stiff_fits": "Fits that start badly or have no single answer: what each solver leaves of the way from the start "
+        "to the best value that is known (an optimum, or the best that any of them found)."
+    }
 
 
 def tables(data: Data) -> list[Table]:
