@@ -48,8 +48,8 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
 def captions(data: Data) -> dict[str, str]:
     """What the figure shows."""
     return {
-        "errata": "Every wrong equation under a check that its correction passes. Left: how clearly the printed form is "
-        "rejected, in decades of the p-value, or of the deviation over its bound; bars: what was needed. Right: the "
+        "errata": "Every wrong equation under a check that its correction passes. Left: how clearly the printed form "
+        "is rejected, in decades of the p-value, or of the deviation over its bound; bars: what was needed. Right: the "
         "integral as printed over the right one, for slips that scale the light of the scene."
     }
 

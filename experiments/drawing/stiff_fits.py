@@ -45,8 +45,8 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
 def captions(data: Data) -> dict[str, str]:
     """What the figure shows."""
     return {
-        "stiff_fits": "Fits that start badly or have no single answer: what each solver leaves of the way from the start "
-        "to the best value that is known (an optimum, or the best that any of them found)."
+        "stiff_fits": "Fits that start badly or have no single answer: what each solver leaves of the way from the "
+        "start to the best value that is known (an optimum, or the best that any of them found)."
     }
 
 
