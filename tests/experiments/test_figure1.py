@@ -22,7 +22,12 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Data:
     folder = tmp_path_factory.mktemp("figure1")
     presets = ["nonabsorbing", "brown", "black"]
     settings = Figure1(
-        presets=presets, step_deg=2.5, shown_n=[1.0, 20.0], fit_n=[1.0, 20.0, 400.0], measures=[0.0, 2.0]
+        presets=presets,
+        step_deg=2.5,
+        shown_n=[1.0, 20.0],
+        fit_n=[1.0, 20.0, 400.0],
+        measures=[0.0, 2.0],
+        slope_from=20.0,
     )
     write_data(folder, compute(settings, Work(folder, Path(), lambda what: None)))
     return read_data(folder)
