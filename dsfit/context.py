@@ -32,6 +32,14 @@ class Context:
 
     Raises:
         InputError: a field is not a real number, not finite or out of range, shapes do not broadcast, another dtype.
+
+    Example:
+        >>> import dsfit
+        >>> context = dsfit.Context([0.0, 0.5], n=[[0.0], [3.0]])
+        >>> context.batch_shape
+        torch.Size([2, 2])
+        >>> context.v.tolist()
+        [[1.0, 1.0], [0.0, 0.0]]
     """
 
     theta_r: Tensor

@@ -18,6 +18,13 @@ class InputError(ValueError):
         field: the name of the offending argument or config key.
         value: the offending value (its `repr` is shown, shortened to 120 characters).
         allowed: what would have been accepted, in words.
+
+    Example:
+        >>> import dsfit
+        >>> dsfit.Context(2.0)
+        Traceback (most recent call last):
+            ...
+        dsfit.errors.InputError: context.theta_r: got 2.0; allowed: numbers in [-1.5708, 1.5708]
     """
 
     def __init__(self, field: str, value: object, allowed: str) -> None:

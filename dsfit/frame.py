@@ -52,7 +52,15 @@ def reachable(theta_r: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def to_vector(omega: Tensor) -> Tensor:
-    """(theta, phi) `[..., 2]` to the unit vector `[..., 3]` in (tangent, normal, binormal)."""
+    """(theta, phi) `[..., 2]` to the unit vector `[..., 3]` in (tangent, normal, binormal).
+
+    Example:
+        >>> import torch
+        >>> from dsfit.frame import to_angles, to_vector
+        >>> omega = torch.tensor([0.5, -2.0], dtype=torch.float64)
+        >>> [round(x, 6) for x in to_angles(to_vector(omega)).tolist()]
+        [0.5, -2.0]
+    """
     theta, phi = omega.unbind(-1)
     cos_theta = cos_inclination(theta)
     return torch.stack([torch.sin(theta), cos_theta * torch.cos(phi), cos_theta * torch.sin(phi)], dim=-1)

@@ -40,6 +40,19 @@ class Material:
         n, v: scattering fibres and directly lit share that the proposal is told, and, without `scattering`, the BSDF
             too.
         scattering: n and v towards each direction.
+
+    Example:
+        >>> import math
+        >>> import torch
+        >>> import dsfit
+        >>> from dsfit.proposals import UniformSphere
+        >>> material = dsfit.Material(dsfit.DualScattering(dsfit.Fiber.preset("blond")), UniformSphere())
+        >>> wo = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+        >>> drawn = material.sample_f(wo, torch.tensor([0.3, 0.6], dtype=torch.float64))
+        >>> math.isclose(float(drawn.pdf), 1 / (4 * math.pi))
+        True
+        >>> bool(torch.allclose(drawn.f, material.f(wo, drawn.wi)))
+        True
     """
 
     def __init__(

@@ -48,6 +48,14 @@ class Reference:
 class Nodes:
     """Quadrature nodes of one context: omega `[Q, 2]`, solid-angle weights `[Q]` (sum w f ~ int f domega), values
     `[Q, C]`.
+
+    Example:
+        >>> import torch
+        >>> import dsfit
+        >>> cosine = dsfit.FunctionIntegrand(lambda omega, context: torch.cos(omega[..., :1]))
+        >>> nodes = dsfit.quadrature_nodes(cosine, dsfit.Context(0.0))
+        >>> round(float(nodes.weight.sum()), 6)  # 4 pi
+        12.566371
     """
 
     omega: Tensor
@@ -122,6 +130,13 @@ def reference(
 
     Raises:
         InputError: `rtol` is not in (0, 1), no context, or an integrand that is none.
+
+    Example:
+        >>> import dsfit
+        >>> furnace = dsfit.Integrand(dsfit.DualScattering(dsfit.Fiber.preset("nonabsorbing")))
+        >>> found = dsfit.reference(furnace, dsfit.Context(0.0, n=0.0), rtol=1e-5)
+        >>> [round(x, 3) for x in found.value.tolist()], bool(found.converged)
+        ([1.468, 1.468, 1.468], True)
     """
     _check(integrand, context, rtol, max_evaluations)
     context = context.to(torch.float64)
@@ -163,6 +178,14 @@ def quadrature_nodes(
     Args:
         context: a single context (batch shape `()`).
         even: keep only phi >= 0, with doubled weights. Only for integrands and densities even in azimuth.
+
+    Example:
+        >>> import torch
+        >>> import dsfit
+        >>> cosine = dsfit.FunctionIntegrand(lambda omega, context: torch.cos(omega[..., :1]))
+        >>> nodes = dsfit.quadrature_nodes(cosine, dsfit.Context(0.0), rtol=1e-5)
+        >>> round(float((nodes.weight * nodes.norm).sum()), 6)
+        9.869605
     """
     _check(integrand, context, rtol)
     context = context.to(torch.float64)
@@ -203,6 +226,14 @@ def excess(
     """Excess of a proposal's density, `int (p* - p)^2/p domega`: no cancellation however close p is to p*.
 
     `rtol` is relative to the excess (with an absolute floor of 1e-7).
+
+    Example:
+        >>> import torch
+        >>> import dsfit
+        >>> from dsfit.proposals import UniformSphere
+        >>> cosine = dsfit.FunctionIntegrand(lambda omega, context: torch.cos(omega[..., :1]))
+        >>> round(float(dsfit.excess(cosine, UniformSphere(), dsfit.Context(0.0)).value), 5)  # 32 / (3 pi^2) - 1
+        0.08076
     """
     _check(integrand, context, rtol, max_evaluations)
     if not callable(proposal):

@@ -48,6 +48,13 @@ def uniforms(
 
     Raises:
         InputError: unknown kind or dtype, bad shape or dimension, no generator.
+
+    Example:
+        >>> import torch
+        >>> from dsfit.random import uniforms
+        >>> u = uniforms((1024,), 2, generator=torch.Generator().manual_seed(0), kind="sobol")
+        >>> bool(((u.mean(0) - 0.5).abs() < 1e-3).all())
+        True
     """
     return torch.cat(list(uniform_chunks(shape, dimension, generator=generator, kind=kind, dtype=dtype, device=device)))
 

@@ -31,6 +31,15 @@ class ContextStream:
 
     Raises:
         InputError: an argument is out of range.
+
+    Example:
+        >>> import torch
+        >>> import dsfit
+        >>> contexts = dsfit.ContextStream(direct=0.5).draw(1024, torch.Generator().manual_seed(0))
+        >>> contexts.batch_shape
+        torch.Size([1024])
+        >>> round(float((contexts.n == 0).double().mean()), 2)
+        0.5
     """
 
     theta: str = "sphere"

@@ -33,6 +33,14 @@ class Averages:
         A_b: backward attenuation of the surrounding hair, A_1 + A_3.
         delta_b: average longitudinal shift of back scattering.
         sigma_b: standard deviation of back scattering.
+
+    Example:
+        >>> import torch
+        >>> import dsfit
+        >>> bsdf = dsfit.DualScattering(dsfit.Fiber.preset("nonabsorbing"))
+        >>> averages = bsdf.averages(torch.tensor(0.0, dtype=torch.float64))
+        >>> round(float(averages.a_f[0]), 4), round(float(averages.a_b[0]), 4)
+        (0.7772, 0.1997)
     """
 
     a_f: Tensor

@@ -43,6 +43,13 @@ class Convention:
             passed on by E[a_f^N | N >= 1].
         simplified_energy: the simplified azimuths (21), (25) carry each lobe's "attenuation" integral, or are
             "printed" bare.
+
+    Example:
+        >>> import dsfit
+        >>> dsfit.Convention.named("printed").lobe_norm
+        'printed'
+        >>> dsfit.Convention.named("consistent", share="sum") == dsfit.Convention(share="sum")
+        True
     """
 
     lobe_norm: Literal["energy", "printed"] = "energy"

@@ -59,6 +59,14 @@ class DualScattering(FiberAverages):
         InputError: d_f or d_b outside [0, 1], unknown azimuthal model, convention or precision, a table asked of a
             batch of fibres, of an eccentric fibre, of one that requires gradients, or of `raw` azimuths, or grey terms
             of a fibre that is not grey.
+
+    Example:
+        >>> import torch
+        >>> import dsfit
+        >>> bsdf = dsfit.DualScattering(dsfit.Fiber.preset("brown"))
+        >>> theta_i, theta_r, phi = torch.tensor([0.2, -0.3, 0.5], dtype=torch.float64)
+        >>> [f"{x:.4f}" for x in bsdf(theta_i, theta_r, phi, n=0.0, v=1.0).tolist()]
+        ['0.0229', '0.0190', '0.0160']
     """
 
     def __init__(

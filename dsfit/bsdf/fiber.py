@@ -73,6 +73,14 @@ class Fiber:
 
     Raises:
         InputError: a field is unknown, not finite, of the wrong shape, or out of range.
+
+    Example:
+        >>> import dsfit
+        >>> fiber = dsfit.Fiber.preset("blond", eccentricity=0.9)
+        >>> [round(x, 2) for x in fiber.sigma_a.tolist()]
+        [0.03, 0.07, 0.15]
+        >>> fiber.is_round, fiber.channels
+        (False, 3)
     """
 
     sigma_a: Tensor

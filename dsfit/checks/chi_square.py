@@ -108,6 +108,16 @@ def chi_square(
 
     Raises:
         InputError: the context is a batch, or fewer than 100 samples.
+
+    Example:
+        >>> import torch
+        >>> import dsfit
+        >>> from dsfit.checks.chi_square import chi_square
+        >>> from dsfit.proposals import UniformSphere
+        >>> g = torch.Generator().manual_seed(0)
+        >>> found = chi_square(UniformSphere(), dsfit.Context(0.0), 2000, (6, 6), generator=g)
+        >>> found.p_value > 0.01, round(found.mass, 6)
+        (True, 1.0)
     """
     if context.batch_shape != ():
         raise InputError("context", tuple(context.batch_shape), "a single context, of batch shape ()")

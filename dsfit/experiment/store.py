@@ -41,6 +41,15 @@ def save_proposal(path: str | Path, proposal: nn.Module) -> None:
 
     Raises:
         InputError: the proposal holds something that is not a tensor, plain data or a `dsfit` object (a lambda, say).
+
+    Example:
+        >>> import tempfile
+        >>> import dsfit
+        >>> from dsfit.proposals import UniformSphere
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     dsfit.save_proposal(f"{folder}/uniform.npz", UniformSphere())
+        ...     dsfit.load_proposal(f"{folder}/uniform.npz")
+        UniformSphere()
     """
     from dsfit.proposals.base import Proposal
 
@@ -62,6 +71,17 @@ def load_proposal(path: str | Path) -> Any:
     Raises:
         InputError: the file is missing, truncated or damaged, has another schema version, or needs a class this dsfit
         does not have.
+
+    Example:
+        >>> import tempfile
+        >>> import dsfit
+        >>> from dsfit.proposals import GaussianLobe, Mixture, Product, UniformAzimuth
+        >>> mixture = Mixture([Product(GaussianLobe(0.1, 0.2), UniformAzimuth())], defensive=0.1)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     dsfit.save_proposal(f"{folder}/mixture.npz", mixture)
+        ...     again = dsfit.load_proposal(f"{folder}/mixture.npz")
+        >>> again.defensive, [type(part).__name__ for part in again.components]
+        (0.1, ['Product'])
     """
     from dsfit.proposals.base import Proposal
 

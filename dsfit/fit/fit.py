@@ -119,6 +119,16 @@ def fit(
     Raises:
         InputError: unknown objective, solver or option; a proposal without learnable parameters or that cannot be
             copied; an integrand that is zero or not finite on the nodes; a start whose objective is not finite.
+
+    Example:
+        >>> import torch
+        >>> import dsfit
+        >>> from dsfit.proposals import GaussianLobe, Mixture, Product, UniformAzimuth
+        >>> ridge = dsfit.FunctionIntegrand(lambda omega, context: torch.exp(-50 * (omega[..., :1] - 0.2) ** 2))
+        >>> start = Mixture([Product(GaussianLobe(0.0, 0.2), UniformAzimuth())])
+        >>> found = dsfit.fit(start, ridge, dsfit.Context(0.0), solver="torch.lbfgs")
+        >>> [f"{float(dsfit.excess(ridge, p, dsfit.Context(0.0)).value):.2g}" for p in (start, found.proposal)]
+        ['2.3', '0.035']
     """
     began = time.perf_counter()
     if isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:

@@ -181,6 +181,15 @@ def heuristic(kind: str | Mapping[str, Any] | Heuristic, **parameters: Any) -> H
 
     Raises:
         InputError: unknown name or parameter, or a parameter out of range.
+
+    Example:
+        >>> import torch
+        >>> from dsfit.mis import heuristic
+        >>> log_p = torch.log(torch.tensor([3.0, 1.0], dtype=torch.float64))
+        >>> heuristic("balance").weights(log_p, torch.ones(2)).tolist()
+        [0.75, 0.25]
+        >>> [round(w, 4) for w in heuristic("power").weights(log_p, torch.ones(2)).tolist()]
+        [0.9, 0.1]
     """
     if isinstance(kind, Heuristic):
         if parameters:

@@ -63,6 +63,17 @@ def mis_variance(
 
     Raises:
         InputError: bad counts or model, or a node where F is not 0 but no strategy with samples has density.
+
+    Example:
+        >>> import torch
+        >>> import dsfit
+        >>> from dsfit.mis.variance import mis_variance
+        >>> from dsfit.proposals import UniformSphere
+        >>> cosine = dsfit.FunctionIntegrand(lambda omega, context: torch.cos(omega[..., :1]))
+        >>> nodes = dsfit.quadrature_nodes(cosine, dsfit.Context(0.0), 1e-5)
+        >>> log_p = UniformSphere()(dsfit.Context(0.0)).log_prob(nodes.omega)[None]
+        >>> round(float(mis_variance(nodes.value, nodes.weight, log_p, [1]).excess), 5)
+        0.08076
     """
     check_choice("model", model, ("multi", "one"))
     rule = as_heuristic(heuristic)

@@ -58,6 +58,15 @@ class AmortisedProposal(Proposal):
 
     Raises:
         InputError: a batch of fibres, or `defensive` out of range.
+
+    Example:
+        >>> import torch
+        >>> import dsfit
+        >>> proposal = dsfit.AmortisedProposal(dsfit.DualScattering(dsfit.Fiber.preset("blond"), precision="table"))
+        >>> law = proposal(dsfit.Context([0.0, 0.5], n=0.0))
+        >>> omega = law.sample(torch.rand(10, 2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))
+        >>> omega.shape, law.log_prob(omega).shape
+        (torch.Size([10, 2, 2]), torch.Size([10, 2]))
     """
 
     def __init__(

@@ -77,6 +77,14 @@ class FamilyProposal(Proposal):
 
     Raises:
         InputError: an argument out of range.
+
+    Example:
+        >>> import dsfit
+        >>> bsdf = dsfit.DualScattering(dsfit.Fiber.preset("brown"), precision="table")
+        >>> proposal = dsfit.FamilyProposal().of(bsdf)  # in half a second, here of the untrained family
+        >>> context = dsfit.Context(0.2, n=0.0)
+        >>> float(dsfit.excess(dsfit.Integrand(bsdf), proposal, context, 1e-2).value) < 0.05
+        True
     """
 
     def __init__(

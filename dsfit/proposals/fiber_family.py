@@ -40,6 +40,13 @@ class FiberFamily:
 
     Raises:
         InputError: a range that is empty or outside what the BSDF allows.
+
+    Example:
+        >>> import torch
+        >>> import dsfit
+        >>> fibers = dsfit.FiberFamily(absorption=(0.1, 1.0), eccentric=0.0).draw(4, torch.Generator().manual_seed(0))
+        >>> all(bsdf.fiber.is_round and float(bsdf.fiber.sigma_a.max()) <= 1 for bsdf in fibers)
+        True
     """
 
     absorption: tuple[float, float] = (0.01, 12.0)

@@ -145,6 +145,19 @@ class Mixture(Proposal):
 
     Raises:
         InputError: no component, weights of the wrong number or not positive, defensive out of range.
+
+    Example:
+        >>> import torch
+        >>> from dsfit import Context
+        >>> from dsfit.proposals import GaussianLobe, Mixture, Product, UniformAzimuth
+        >>> lobes = [Product(GaussianLobe(mean, 0.1), UniformAzimuth()) for mean in (-0.05, 0.05)]
+        >>> mixture = Mixture(lobes, weights=[3.0, 1.0], defensive=0.2)
+        >>> [round(w, 2) for w in mixture.weights().tolist()]
+        [0.6, 0.2]
+        >>> u = torch.rand(4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        >>> omega, log_p = mixture(Context(0.3)).sample_with_log_prob(u)
+        >>> omega.shape, log_p.shape
+        (torch.Size([4, 2]), torch.Size([4]))
     """
 
     logits: Tensor

@@ -55,6 +55,16 @@ class StructuredProposal(Mixture):
         extra: further proposals by name that the mixture takes in, such as `{"light": light.proposal()}`, each starting
             with `extra_share`.
         extra_share: initial share of each of them.
+
+    Example:
+        >>> import dsfit
+        >>> bsdf = dsfit.DualScattering(dsfit.Fiber.preset("blond"), precision="table")
+        >>> context = dsfit.Context(0.3, n=0.0)
+        >>> proposal = dsfit.StructuredProposal(bsdf, context)
+        >>> proposal.names
+        ('R', 'TT', 'TRT', 'back', 'broad')
+        >>> round(float(dsfit.excess(dsfit.Integrand(bsdf), proposal, context, 1e-2).value), 3)
+        0.008
     """
 
     def __init__(

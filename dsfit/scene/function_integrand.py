@@ -30,6 +30,13 @@ class FunctionIntegrand:
     Raises:
         InputError: points out of range; when called, directions that do not fit the context, or a result of another
             shape.
+
+    Example:
+        >>> import torch
+        >>> import dsfit
+        >>> cosine = dsfit.FunctionIntegrand(lambda omega, context: torch.cos(omega[..., :1]))
+        >>> round(float(dsfit.reference(cosine, dsfit.Context(0.0)).value), 8)  # pi^2
+        9.8696044
     """
 
     def __init__(

@@ -33,6 +33,14 @@ class Integrand:
 
     Raises:
         InputError: channels that do not agree; directions not finite, or that do not broadcast with the context.
+
+    Example:
+        >>> import torch
+        >>> import dsfit
+        >>> furnace = dsfit.Integrand(dsfit.DualScattering(dsfit.Fiber.preset("blond")))
+        >>> omega_i = torch.tensor([[0.1, 0.0], [0.1, 3.0]], dtype=torch.float64)
+        >>> [[f"{x:.3f}" for x in row] for row in furnace(omega_i, dsfit.Context(0.2, n=0.0)).tolist()]
+        [['0.106', '0.086', '0.057'], ['0.838', '0.764', '0.639']]
     """
 
     def __init__(self, bsdf: DualScattering, light: Light | None = None, scattering: Scattering | None = None) -> None:

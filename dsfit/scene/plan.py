@@ -139,6 +139,13 @@ def plan(integrand: Integrand, contexts: Context | ContextRange, tolerance: floa
 
     Raises:
         InputError: an integrand that is none (or has a BSDF of another kind), no context, a tolerance out of range.
+
+    Example:
+        >>> import dsfit
+        >>> integrand = dsfit.Integrand(dsfit.DualScattering(dsfit.Fiber.preset("blond"), d_b=0.0))
+        >>> found = dsfit.plan(integrand, dsfit.Context(0.3, n=0.0))
+        >>> found.bound, found.kept
+        (0.0, (('direct', 'R'), ('direct', 'TT'), ('direct', 'TRT')))
     """
     whole = integrand.whole if isinstance(integrand, PlannedIntegrand) else integrand
     if not isinstance(whole, Integrand) or type(whole.bsdf) is not DualScattering:

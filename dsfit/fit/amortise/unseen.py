@@ -127,6 +127,14 @@ def held_out(
 
     Raises:
         InputError: an integrand that is none, no context, or a negative number of checks.
+
+    Example:
+        >>> import dsfit
+        >>> from dsfit.proposals import UniformSphere
+        >>> furnace = dsfit.Integrand(dsfit.DualScattering(dsfit.Fiber.preset("blond"), precision="table"))
+        >>> found = dsfit.held_out(furnace, UniformSphere(), dsfit.Context([0.0, 0.8], n=0.0), check=0)
+        >>> [round(x, 1) for x in found.excess.tolist()]
+        [5.7, 4.3]
     """
     if not isinstance(integrand, Integrand):
         raise InputError("integrand", type(integrand).__name__, "an Integrand")

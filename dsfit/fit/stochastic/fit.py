@@ -109,6 +109,16 @@ def fit_stochastic(
         InputError: an argument out of range; a proposal without learnable parameters, that cannot be copied, or whose
             density is zero where the integrand is not (give it a defensive share); a bad answer of the integrand; a
             stream for a solver that keeps samples.
+
+    Example:
+        >>> import torch
+        >>> import dsfit
+        >>> from dsfit.proposals import GaussianLobe, Mixture, Product, UniformAzimuth
+        >>> ridge = dsfit.FunctionIntegrand(lambda omega, context: torch.exp(-50 * (omega[..., :1] - 0.2) ** 2))
+        >>> start = Mixture([Product(GaussianLobe(0.0, 0.2), UniformAzimuth())])
+        >>> found = dsfit.fit_stochastic(start, ridge, dsfit.Context(0.0), samples_per_step=128, steps=6)
+        >>> found.evaluations, float(dsfit.excess(ridge, found.proposal, dsfit.Context(0.0)).value) < 0.05
+        (1792, True)
     """
     began = time.perf_counter()
     for name, value, least in (

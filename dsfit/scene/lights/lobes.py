@@ -66,6 +66,16 @@ class VonMisesFisherLights(Light):
 
     Raises:
         InputError: an argument is out of range, shapes do not fit, or all intensities and the ambient are zero.
+
+    Example:
+        >>> import math
+        >>> import torch
+        >>> from dsfit.scene.lights import VonMisesFisherLights
+        >>> kappa = VonMisesFisherLights.kappa_of_width(math.radians(12))
+        >>> light = VonMisesFisherLights([[0.3, 2.5]], kappa, ambient=0.02)
+        >>> omega_i = torch.tensor([[0.3, 2.5], [0.0, 0.0]], dtype=torch.float64)  # the lobe's centre, and elsewhere
+        >>> [round(x, 3) for x in light(omega_i)[..., 0].tolist()]
+        [3.648, 0.02]
     """
 
     directions: Tensor

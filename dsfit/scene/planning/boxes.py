@@ -27,6 +27,12 @@ class ContextRange:
 
     Raises:
         InputError: a range that is no pair of increasing numbers, or out of its domain.
+
+    Example:
+        >>> import dsfit
+        >>> unlit = dsfit.ContextRange(n=(1.0, 30.0), v=(0.0, 0.0))
+        >>> dsfit.plan(dsfit.Integrand(dsfit.DualScattering(dsfit.Fiber.preset("blond"))), unlit).kept[0]
+        ('scattered', 'R')
     """
 
     theta_r: tuple[float, float] = (-HALF_PI, HALF_PI)
