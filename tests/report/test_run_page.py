@@ -177,3 +177,17 @@ def test_one_clear_error_for_what_is_no_run(tmp_path: Path) -> None:
         write_report(tmp_path / "file")
     found = CLI.invoke(app, ["report", str(tmp_path)])
     assert found.exit_code == 0 and str(tmp_path / "report.html") in found.output
+
+
+def test_drawing_a_run_writes_its_page_and_force_removes_it(copy_of: RunOf) -> None:
+    from dsfit.experiment.rundir import RunDirectory
+
+    folder = copy_of("check")
+    before = write_report(folder).read_bytes()  # of this folder, whose name it tells
+    (folder / "report.html").unlink()
+    assert CLI.invoke(app, ["show", str(folder)]).exit_code == 0 and not (folder / "report.html").exists()
+    found = CLI.invoke(app, ["show", str(folder), "--plots"])
+    assert found.exit_code == 0 and f"report:    {folder / 'report.html'}" in found.output
+    assert (folder / "report.html").read_bytes() == before
+    RunDirectory(folder).clear()
+    assert not (folder / "report.html").exists()
