@@ -41,6 +41,7 @@ _TECHNIQUES = {
         '{name="fitted, Sobol", kind="guided", options=OPTIONS}',
     ),
 }
+_MAP_QUALITY = 50
 LOW, HIGH = 0.01, 2.0
 """Relative errors at the ends of the error maps."""
 Count = Annotated[int, Field(ge=1, le=2**20)]
@@ -65,7 +66,7 @@ class Figure2(Settings):
     training_steps: Count = 2400
     predicted_pixels: Count = 160
     nodes: Annotated[int, Field(ge=16, le=2**16)] = 2048
-    quality: Annotated[int, Field(ge=30, le=100)] = 88
+    quality: Annotated[int, Field(ge=30, le=100)] = 80
     crop: Annotated[float, Field(gt=0, le=1)] = 0.6
 
 
@@ -149,12 +150,14 @@ def _pictures(
     arrays: dict[str, np.ndarray], scene: str, directory: RunDirectory, found: dict[str, Any], tone: ToneMap,
     settings: Figure2,
 ) -> None:  # fmt: skip
-    """JPEG files of the pictures, tone-mapped alike, and of their error maps (256 steps of log error)."""
+    """JPEG files of the pictures with random points, tone-mapped alike, and of their error maps (log error)."""
     stored = directory.arrays(0)
     reference, covered = torch.from_numpy(stored["radiance"]), torch.from_numpy(stored["coverage"]) > 0
     tone = tone.fixed(reference, covered)
     arrays[f"{scene}.{REFERENCE}"] = _jpeg(tone(reference), settings.quality)
     for name in found["techniques"]:
+        if found["of"][name]["uniforms"] != "random":  # in the table alone
+            continue
         images = directory.arrays(found["of"][name]["index"])
         for which in ("equal_time", "equal_samples"):
             image = torch.from_numpy(images[which])
@@ -162,7 +165,7 @@ def _pictures(
             shade = torch.log(error.clamp(LOW, HIGH) / LOW) / np.log(HIGH / LOW) * covered
             window = _window(image.shape, 1.0 if which == "equal_time" else settings.crop)
             arrays[f"{scene}.{name}.{which}"] = _jpeg(tone(image)[window], settings.quality)
-            arrays[f"{scene}.{name}.{which}.map"] = _jpeg(shade[..., None][window], settings.quality)
+            arrays[f"{scene}.{name}.{which}.map"] = _jpeg(shade[..., None][window], _MAP_QUALITY)
 
 
 def _window(shape: torch.Size, part: float) -> tuple[slice, slice]:
