@@ -53,7 +53,8 @@ def compute(settings: Averaging, work: Work) -> Data:
     work.say("error against run time")
     arrays |= _timed(settings, spots, arrays["single"])
     record = {
-        **settings.model_dump(), "names": list(proposals(settings.contexts[0]["preset"])), "readings": readings,
+        **settings.model_dump(exclude={"seed"}),
+        "names": list(proposals(settings.contexts[0]["preset"])), "readings": readings,
         "good": settings.order[_best(arrays["single"][0])],
         "best": [settings.order[_best(row)] for row in arrays["single"]],
     }  # fmt: skip

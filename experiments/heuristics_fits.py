@@ -79,7 +79,12 @@ def compute(settings: HeuristicsFits, work: Work) -> Data:
         work.say(f"{preset}: error against run time")
         for name, values in one.timing(settings.seed + 10_000 * index).items():
             arrays[f"{preset}.{name}"] = values
-    record = {**settings.model_dump(), "methods": list(METHODS), "groups": list(GROUPS), "seconds": facts}
+    record = {
+        **settings.model_dump(exclude={"seed"}),
+        "methods": list(METHODS),
+        "groups": list(GROUPS),
+        "seconds": facts,
+    }
     return Data(arrays, record)
 
 
