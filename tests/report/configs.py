@@ -7,7 +7,7 @@ _ESTIMATE = """
 samples = [16, 64]
 repeats = 4
 rounds = 2
-rtol = 1e-3
+rtol = 1e-2
 """
 _METHODS = """
 [[methods]]

@@ -88,7 +88,7 @@ def test_markup_in_titles_names_labels_and_logs_is_text(copy_of: RunOf) -> None:
     assert not re.search("[\x00\x1b\u202e]", path.read_text())
 
 
-@pytest.mark.parametrize("kind", QUICK)
+@pytest.mark.parametrize("kind", ["compare", "check", pytest.param("render", marks=pytest.mark.slow)])
 def test_a_damaged_result_gives_a_page_that_says_so(copy_of: RunOf, kind: str) -> None:
     folder = copy_of(kind)
     whole = json.loads((folder / "result.json").read_text())
