@@ -8,7 +8,7 @@ import numpy as np
 
 from dsfit.checks.stability.function import CLASSES
 from dsfit.experiment.files import number
-from dsfit.figures import Close, Data, Experiment, Settings, Work
+from dsfit.figures import Close, Data, Experiment, Measured, Settings, Work
 from experiments._check_runs import findings, names
 
 QUANTITIES = ("value", "gradient")
@@ -85,11 +85,13 @@ EXPERIMENT = Experiment(
     compute=compute,
     minutes=3,
     reproduces={
-        # Rounding differs from machine to machine: no error may be ten times what is stored.
-        "error.float64.*": Close(9.0, 1e-15),
-        "error.float32.*": Close(9.0, 5e-7),
-        "naive.float64.*": Close(9.0, 1e-15),
-        "naive.float32.*": Close(9.0, 5e-7),
+        # Rounding differs with the instruction set, single errors by 14 times and more: none may be a hundred times
+        # what is stored. That all are within their stated limits (`beyond`) is held exactly.
+        "error.float64.*": Close(99.0, 1e-15),
+        "error.float32.*": Close(99.0, 5e-7),
+        "naive.float64.*": Close(99.0, 1e-15),
+        "naive.float32.*": Close(99.0, 5e-7),
+        "worst_regime": Measured(),
     },
     small=('functions=["special.log_mills", "bsdf.A_b", "frame.wrap"]',),
 )

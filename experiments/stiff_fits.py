@@ -9,7 +9,7 @@ import numpy as np
 
 from dsfit.checks.stiff_fits.compare import compare
 from dsfit.experiment.files import number
-from dsfit.figures import Data, Experiment, Measured, Settings, Work
+from dsfit.figures import Close, Data, Experiment, Measured, Settings, Work
 from experiments._check_runs import findings, names
 
 DECADES = 6.0
@@ -46,9 +46,8 @@ def compute(settings: StiffFits, work: Work) -> Data:
         arrays["left"][at] = _left(finding["data"])
         arrays["converged"][at] = finding["data"]["converged"]
         arrays["faults"][at] = int(number(finding["value"]))
-    rows = [
-        {
-            "solver": row.solver,
+    rows = {
+        row.solver: {
             "problems": row.problems,
             "solved": row.solved,
             "converged": row.converged,
@@ -57,7 +56,7 @@ def compute(settings: StiffFits, work: Work) -> Data:
             "seconds": row.seconds,
         }
         for row in compare(found)
-    ]
+    }
     return Data(arrays, {"problems": problems, "solvers": solvers, "rows": rows})
 
 
@@ -75,6 +74,15 @@ EXPERIMENT = Experiment(
     settings=StiffFits,
     compute=compute,
     minutes=2.5,
-    reproduces={"rows.*.seconds": Measured()},
+    reproduces={
+        # The paths of badly posed fits amplify rounding. Held are the shares of problems, and, exactly, that there is
+        # no false claim (`faults`).
+        "left": Measured(),
+        "converged": Measured(),
+        "rows.*.solved": Close(0.0, 0.15),
+        "rows.*.converged": Close(0.0, 0.15),
+        "rows.*.evaluations": Close(1.0),
+        "rows.*.seconds": Measured(),
+    },
     small=('problems=["rosenbrock_scaled"]', 'solvers=["optimistix.lm", "torch.lbfgs"]'),
 )

@@ -55,13 +55,15 @@ def tables(data: Data) -> list[Table]:
     head = ["solver", "problems", "solved / %", "converged / %", "false claims / %", "evaluations", "seconds"]
     rows = [
         [
-            row["solver"],
+            solver,
             str(row["problems"]),
             *(f"{100 * row[key]:.0f}" for key in ("solved", "converged", "faulty")),
             f"{row['evaluations']:.0f}",
             f"{row['seconds']:.2f}",
         ]
-        for row in data.record["rows"]
+        for solver, row in sorted(
+            data.record["rows"].items(), key=lambda item: (-item[1]["solved"], item[1]["seconds"])
+        )
     ]
     caption = (
         "Solvers on badly posed fits. Solved: at the best known value; converged: claimed; evaluations and seconds: "
