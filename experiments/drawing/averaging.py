@@ -63,7 +63,7 @@ def _proposals(data: Data, page: Page) -> Figure:
         )  # fmt: skip
         low = 0.6 * min(float(a["balance.exact"][i].min()), float(best.min()))
         axis.set(title=_title(context), yscale="log", ylim=(low, TOP))
-        axis.set_xticks(x, order, rotation=60, ha="right")
+        axis.set_xticks(x, [name.replace("transmittance", "transm.") for name in order], rotation=60, ha="right")
         axis.grid(True)
     for axis in axes[::2]:
         axis.set_ylabel("N Var / |∫F|²")
