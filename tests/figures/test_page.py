@@ -77,6 +77,21 @@ def test_lines_marks_and_handles_shrink():
             assert box.x0 <= extent.x0 and extent.x1 <= box.x1 and box.y0 <= extent.y0 and extent.y1 <= box.y1
 
 
+def handle_widths(figure: Figure) -> np.ndarray:
+    """Of areas in the legends, in points."""
+    figure.draw_without_rendering()
+    legends = [figure.axes[0].get_legend(), *figure.legends]
+    handles = [legend.legend_handles[2] for legend in legends]
+    return np.array([handle.get_window_extent().width for handle in handles]) * 72 / figure.dpi
+
+
+def test_handles_of_legends_keep_to_their_type():
+    with styled():
+        before = handle_widths(figure_of(10.0, 5.0))
+        after = handle_widths(Page(127.0).adopt(figure_of(10.0, 5.0)))
+    assert after / before == pytest.approx(5.5 / 8, rel=0.05)  # type stopped there, below it half
+
+
 def test_nothing_leaves_the_page(tmp_path: Path):
     with styled():
         figure = Page(150.0).adopt(figure_of(14.0, 7.0))
