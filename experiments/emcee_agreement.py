@@ -31,7 +31,8 @@ class EmceeAgreement(Settings):
 
 def compute(settings: EmceeAgreement, work: Work) -> Data:
     """Every preset at every context."""
-    from experiments._emcee_cell import BINS, Sizes, compare, walk
+    from experiments._emcee_cell import Sizes, compare, walk
+    from experiments._emcee_marginals import BINS
 
     sizes = Sizes(**{name: getattr(settings, name) for name in Sizes.__annotations__})
     arrays: dict[str, np.ndarray] = {}

@@ -21,7 +21,7 @@ from dsfit.figures.experiment import Work
 from dsfit.figures.page import Page
 from dsfit.figures.verify import error_name, rules_of
 from dsfit.proposals.base import Distribution, Proposal
-from experiments._emcee_cell import Cell, Sizes, Walk, autocorrelation, compare, walk
+from experiments._emcee_cell import Cell, Sizes, Walk, acceptance, autocorrelation, compare, walk
 from experiments.drawing import emcee_agreement as drawing
 from experiments.drawing._emcee_corner import _level
 from experiments.drawing._emcee_costs import ACCURACY, costs
@@ -119,6 +119,16 @@ def test_autocorrelation_of_a_known_chain(steps, expected):
     tau, error = autocorrelation(Chains(place, x, np.ones(8), np.zeros(8), np.zeros(8, dtype=int), 1))
     assert 0 < error < 0.5
     assert tau == pytest.approx(expected, abs=4 * error)
+
+
+def test_acceptance_scatters_as_the_kinds_of_moves_do():
+    """In half of the steps everybody moves, in the others nobody: the share of 1/2 is known to 1 / sqrt(4 steps)."""
+    random, steps = np.random.default_rng(1), 401
+    moves = random.random((steps, 1, 1, 1)) < 0.5
+    place = np.cumsum(np.broadcast_to(moves, (steps, 8, 16, 2)), axis=0).astype(float)
+    share, error = acceptance(Chains(place, place[..., 0], np.ones(8), np.zeros(8), np.zeros(8, dtype=int), 1))
+    assert error == pytest.approx(0.5 / math.sqrt(steps - 1), rel=0.05)
+    assert share == pytest.approx(0.5, abs=4 * error)
 
 
 def known(**changes) -> dict:
