@@ -70,6 +70,9 @@ def costs_figure(data: Data, page: Page) -> Figure:
     cells = [data.record["cells"][name] for name in data.record["order"]]
     found = [costs(cell) for cell in cells]
     figure = page.figure(max(0.45, 0.2 + 0.032 * len(cells)))
+    figure.set_layout_engine(None)  # by hand: tick labels are longer than the automatic layout expects
+    height = figure.get_size_inches()[1]
+    figure.subplots_adjust(left=0.2, right=0.98, top=1 - 0.28 / height, bottom=0.75 / height, wspace=0.06)
     each, integral = figure.subplots(1, 2, sharey=True)
     rows = np.arange(len(cells))
     chain = np.array([one.chain_each for one in found])
@@ -92,5 +95,5 @@ def costs_figure(data: Data, page: Page) -> Figure:
     for panel in (each, integral):
         panel.grid(True, axis="x")
         panel.xaxis.label.set_size(8)
-    figure.legend(loc="outside lower center", ncols=2, frameon=False)
+    figure.legend(loc="lower center", ncols=2, frameon=False)
     return figure
