@@ -111,8 +111,9 @@ def _transmittance(data: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _amortise(data: dict[str, Any]) -> list[dict[str, Any]]:
-    training = {f"training_{key}": data["training"][key] for key in ("steps", "contexts", "seconds")}
-    shared = {**training, "parameters": data["training"]["parameters"]}
+    training = data["training"]
+    shared = {f"training_{key}": training[key] for key in ("steps", "contexts")}
+    shared |= {"parameters": training["parameters"], "training_seconds": training["seconds"]["total"]}
     return [
         {
             **shared,

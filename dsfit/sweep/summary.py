@@ -37,7 +37,7 @@ def markdown(record: dict[str, Any], table: Path, design: Design) -> str:
         "|---|---|---|---:|" + "---:|" * len(measures),
     ]
     for key in design.keys:
-        data = pq.read_table(table, columns=[key, group, "status", *measures])
+        data = pq.read_table(table, columns=[key, group, "status", *measures], read_dictionary=[group, "status"])
         names, status = _codes(data[group]), _codes(data["status"])
         good = status.numbers == status.labels.index("ok") if "ok" in status.labels else np.zeros(len(data), bool)
         numbers = {m: data[m].to_numpy(zero_copy_only=False).astype(float) for m in measures}
@@ -78,7 +78,10 @@ def _codes(column: Any) -> _Codes:
 
     if pa.types.is_list(column.type):
         column = pa.chunked_array([pa.array([str(x) for x in chunk.to_pylist()]) for chunk in column.chunks])
-    encoded = column.combine_chunks().dictionary_encode()
+    if pa.types.is_dictionary(column.type):
+        encoded = column.unify_dictionaries().combine_chunks()
+    else:
+        encoded = column.combine_chunks().dictionary_encode()
     return _Codes(
         encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False), [str(x) for x in encoded.dictionary.to_pylist()]
     )

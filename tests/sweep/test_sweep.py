@@ -105,7 +105,7 @@ def test_the_numbers_are_those_of_a_run_of_one_cell(whole: Path, folder: Path) -
     assert found[0] == expected.iloc[0]
 
 
-@pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize("signal_number", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_killed_and_resumed_the_table_is_the_same(whole: Path, folder: Path, signal_number: int) -> None:
     out = folder / f"killed-{signal_number}"
     command = [sys.executable, "-m", "dsfit.cli", "sweep", str(config(folder)), "--out", str(out), "--workers", "1"]

@@ -13,7 +13,7 @@ import polars
 import pytest
 
 from dsfit.errors import InputError
-from dsfit.experiment import files
+from dsfit.experiment import files, runner
 from dsfit.experiment.cells import jobs
 from dsfit.experiment.validation import load
 from dsfit.sweep import pilot, table, tasks
@@ -21,6 +21,7 @@ from dsfit.sweep.compute import compute
 from dsfit.sweep.failures import reproducing
 from dsfit.sweep.log import CellLog
 from dsfit.sweep.plan import make_plan
+from dsfit.sweep.rows import columns
 from dsfit.sweep.run import run_sweep, sweep_directory
 from dsfit.sweep.table import write_table
 from tests.sweep.cheap import SCENE, SOBOL, FakeMachines, config, measured, rows_of
@@ -142,6 +143,50 @@ def test_files_that_the_config_names_reach_workers_that_do_not_have_them(tmp_pat
     tasks._place.cache_clear()
     there = compute(*again)
     assert there.get("error") is None and there["rows"] == here["rows"]
+
+
+_SMALL = {
+    "compare": """
+[contexts]
+n = [0]
+theta_r_deg = [30]
+[bsdf]
+azimuthal = "simplified"
+precision = "exact"
+[estimate]
+samples = [16]
+repeats = 2
+rounds = 1
+rtol = 1e-2
+[[methods]]
+name = "even"
+kind = "uniform"
+""",
+    "amortise": "[amortise]\nsteps = 1\ninclinations = 4\npairs = 2\ncheck = 0\n",
+    "transmittance": "[transmittance]\nn = [1, 2]\n",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", list(_SMALL))
+def test_rows_of_every_kind_hold_what_a_run_stores(kind: str, tmp_path: Path) -> None:
+    scene = f'kind = "{kind}"\n[fiber]\npreset = "brown"\n[output]\nplots = false\n{_SMALL[kind]}'
+    path = config(tmp_path, '[sweep.grid]\n"fiber.eta" = [1.5]\n', scene)
+    plan = make_plan(path)
+    found = compute(plan.base, plan.task(0))
+    assert found.get("error") is None
+    rows = [dict(zip(columns(kind), row, strict=True)) for row in found["rows"]]
+    (cell,) = runner.run(load(path), tmp_path, workers=0).result["cells"]
+    if kind == "compare":
+        method = cell["methods"][0]
+        assert [row["method"] for row in rows] == ["even"] and rows[0]["theta_r_deg"] == 30
+        assert rows[0]["rmse"] == method["estimates"][-1]["rmse"] and rows[0]["excess"] == method["excess"]
+    elif kind == "amortise":
+        assert [row["group"] for row in rows] == ["start", "held_out"]
+        assert [row["excess_median"] for row in rows] == [cell[g]["median"] for g in ("start", "held_out")]
+        assert rows[0]["training_seconds"] > 0 and rows[0]["training_steps"] == 1
+    else:
+        assert [(row["n"], row["excess"]) for row in rows] == [(fit["n"], fit["excess"]) for fit in cell["fits"]]
 
 
 def test_the_id_follows_the_design(tmp_path: Path) -> None:
