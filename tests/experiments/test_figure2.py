@@ -73,10 +73,11 @@ def test_small_run(tmp_path: Path):
     for name in ("uniform", "best heuristic mix"):
         facts = sky[name]["equal_samples"]
         assert facts["predicted"] == pytest.approx(facts["error"], rel=0.25)
-    # of M_R it sees a tail that the picture has not met
-    assert float(sky["M_R only"]["equal_samples"]["predicted"]) > 3 * sky["M_R only"]["equal_samples"]["error"]
+    # of M_R it sees a tail: most of the second moment is in weights far above the mean
+    predicted = {name: sky[name]["equal_samples"]["predicted"] for name in ("M_R only", "uniform")}
+    assert predicted["M_R only"] > 4 * predicted["uniform"]
     tail = data.arrays["sky.M_R only.moment"]
-    assert tail[np.searchsorted(data.arrays["weights"], 1e3)] > 0.5 > data.arrays["sky.uniform.moment"][30]
+    assert tail[np.searchsorted(data.arrays["weights"], 1e2)] > 0.5 > data.arrays["sky.uniform.moment"][30]
     assert lamp["best heuristic mix + light"]["equal_samples"]["error"] < lamp["M_R only"]["equal_samples"]["error"]
     assert set(drawing.figures(data, Page())) == {"pictures-lamp", "pictures-sky", "weights"}
     assert [len(table.rows) for table in drawing.tables(data)] == [10, 10]
