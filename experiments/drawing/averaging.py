@@ -13,6 +13,7 @@ from dsfit.experiment.files import number
 from dsfit.experiment.plots.style import COLORS, MARKERS
 from dsfit.figures import Data, Table
 from dsfit.figures.page import Page
+from experiments.drawing import _averaging_captions
 
 AVERAGE, BALANCE, BEST, WEIGHTED = COLORS[1], COLORS[0], COLORS[2], COLORS[3]
 TOP = 100.0
@@ -22,6 +23,11 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
     """Number of proposals, pairs, one bad proposal, run time."""
     return {"proposals": _proposals(data, page), "pairs": _pairs(data, page), "bad": _bad(data, page),
             "time": _time(data, page)}  # fmt: skip
+
+
+def captions(data: Data) -> dict[str, str]:
+    """What the figures show."""
+    return _averaging_captions.captions(data, averages, TOP)
 
 
 def tables(data: Data) -> list[Table]:
@@ -35,6 +41,10 @@ def averages(single: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     size = np.arange(1, len(single) + 1)
     with np.errstate(divide="ignore"):
         return np.cumsum(single) / size, size / np.cumsum(1 / single), np.minimum.accumulate(single)
+
+
+def _short_name(name: str) -> str:
+    return name.replace("transmittance_", "transm. ")
 
 
 def _title(context: dict[str, Any]) -> str:
@@ -63,7 +73,7 @@ def _proposals(data: Data, page: Page) -> Figure:
         )  # fmt: skip
         low = 0.6 * min(float(a["balance.exact"][i].min()), float(best.min()))
         axis.set(title=_title(context), yscale="log", ylim=(low, TOP))
-        axis.set_xticks(x, [name.replace("transmittance", "transm.") for name in order], rotation=60, ha="right")
+        axis.set_xticks(x, [_short_name(name) for name in order], rotation=60, ha="right")
         axis.grid(True)
     for axis in axes[::2]:
         axis.set_ylabel("N Var / |∫F|²")
@@ -122,7 +132,7 @@ def _bad(data: Data, page: Page) -> Figure:
             )
     left.axhline(good, color="0.5", lw=0.9)
     left.set(yscale="log", xlim=(0, 1), ylim=(0.08, 40), xlabel="share of the samples of the bad one",
-             ylabel="N Var / |∫F|²", title="with a bad one, quadrature")  # fmt: skip
+             ylabel="N Var / |∫F|²", title="by quadrature")  # fmt: skip
     right.set(xscale="log", yscale="log", xlabel="samples N", ylabel="estimate of N Var / |∫F|²",
               title="equal shares, measured")  # fmt: skip
     for axis in (left, right):
@@ -132,7 +142,7 @@ def _bad(data: Data, page: Page) -> Figure:
         for b, (name, alone) in enumerate(zip(record["bad"], a["bad.single"], strict=True))
     ]
     handles += [
-        Line2D([], [], color="0.5", lw=0.9, label=f"{record['good']} alone, V = {good:.3g}"),
+        Line2D([], [], color="0.5", lw=0.9, label=f"{_short_name(record['good'])} alone, V = {good:.3g}"),
         Line2D([], [], color="0.2", ls="-", label="balance"),
         Line2D([], [], color="0.2", ls="--", label="average, equal weights"),
         Line2D([], [], color="0.2", ls=":", label="average, weights by share"),
@@ -158,7 +168,7 @@ def _time(data: Data, page: Page) -> Figure:
                 1e3 * a["timed.seconds"][i, e], 100 * a["timed.error"][i, e], 196 * a["timed.error_se"][i, e],
                 color=color, marker=MARKERS[e], ms=3.2, lw=1.1,
             )  # fmt: skip
-        axis.set(title=f"{_title(context)}\nbest: {record['best'][i]}", xscale="log", yscale="log")
+        axis.set(title=f"{_title(context)}\nbest: {_short_name(record['best'][i])}", xscale="log", yscale="log")
         for side in (axis.xaxis, axis.yaxis):
             side.set_minor_formatter(NullFormatter())
             side.set_major_locator(LogLocator(subs=(1, 3)))

@@ -27,6 +27,39 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
     return found | {"corner": corner(data, page), "costs": costs_figure(data, page)}
 
 
+def captions(data: Data) -> dict[str, str]:
+    """What the figures show."""
+    ensembles, walkers, steps, burn_in = data.record["sizes"]
+    cells = [cell for _, cell in _cells(data)]
+    walked = f"{ensembles} ensembles of {walkers} walkers ({steps} steps after {burn_in} of burn-in) on |F|"
+    found = {}
+    for k in range(data.record["contexts"]):
+        own = [cell for name, cell in _cells(data) if name.endswith(str(k))]
+        theta_r, n, v = own[0]["context"]
+        least = min(number(cell["p"]["chains_quadrature"]) for cell in own)
+        found[f"marginals_{k}"] = (
+            f"Marginals of |F| / ∫|F| at θ_r = {theta_r:g}°, n = {n:g}, v = {v:g}, a row for each fibre, constant "
+            f"light: places of {walked} (blue), {own[0]['samples']:,} weighted samples of the fitted proposal (orange) "
+            "and quadrature (black); bars: ± 2 standard errors. Below each: deviations of both from the quadrature in "
+            f"standard errors, with a band of ± 2. Means of the walkers against "
+            f"the quadrature: p = {least:.2g} at least."
+        )
+    theta_r, n, v = next(c["context"] for name, c in _cells(data) if name.endswith(str(data.record["shown"])))
+    ratios = [found_costs.chain_integral / found_costs.proposal_integral for found_costs in map(costs, cells)]
+    found["corner"] = (
+        f"Joint density of inclination and azimuth at θ_r = {theta_r:g}°, n = {n:g}, v = {v:g}: share of the places of "
+        f"{walked} in cells of 5° × 10° (colours), and what contains 50, 90 and 99 % of |F| by quadrature (lines); "
+        "beside each the marginals of the walkers (filled) and by quadrature (steps)."
+    )
+    found["costs"] = (
+        f"Evaluations of |F| for one effective sample (left) and for the integral with a standard error of "
+        f"{100 * ACCURACY:g} % (right), by walkers, bridged to the proposal for the integral, and by the fitted "
+        "proposal alone; without the fit, which both need. Bars: ± 2 standard errors of the effective number. "
+        f"For the integral walkers take {min(ratios):.3g} to {max(ratios):.3g} times as many."
+    )
+    return found
+
+
 def tables(data: Data) -> list[Table]:
     """How chains mixed and agree, and what the same error costs."""
     return [_mixing(data), _agreement(data), _costs(data)]

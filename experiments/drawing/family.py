@@ -15,6 +15,8 @@ from dsfit.figures.page import Page
 STREAMS = {"angle": "all inclinations", "sphere": "as a renderer meets them"}
 MEDIAN, P99 = 0, 2
 """Among the levels of quantiles."""
+LEAST = 5e-3
+"""Fibres without absorption are drawn there."""
 
 
 def figures(data: Data, page: Page) -> dict[str, Figure]:
@@ -28,6 +30,30 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
     _by_fiber(single.subplots(), data)
     single.legend(loc="outside lower center", ncols=4, frameon=False)
     return {"unseen": together, "by_fiber": single}
+
+
+def captions(data: Data) -> dict[str, str]:
+    """What the two figures show."""
+    arrays, record = data.arrays, data.record
+    levels = {key: 10 ** arrays[f"{key}.all.log10"] for key in ("angle.untrained", "angle.trained")}
+    median, high = ([values[k] for values in levels.values()] for k in (MEDIAN, P99))
+    numbers = arrays["curve.fibers"]
+    worst, dark = (
+        10 ** arrays["angle.trained.by_fiber.log10"][:, P99],
+        arrays["fiber.sigma_a"][: record["unseen"]].max(-1) > 1,
+    )
+    tails = [float(np.median(worst[some])) if some.any() else float("nan") for some in (~dark, dark)]
+    return {
+        "unseen": f"Excess of one network for a family of fibres at {record['unseen']} fibres that it has not been "
+        "trained on, by quadrature, constant light. Left: share of contexts with a lower excess, before (dotted) and "
+        "after training (lines), for inclinations spread evenly and for contexts as a renderer meets them; with all "
+        f"inclinations training lowers the median from {median[0]:.2g} to {median[1]:.2g}, the 99th percentile from "
+        f"{high[0]:.2g} to {high[1]:.2g}. Right: median and 99th percentile after training with {numbers[0]} to "
+        f"{numbers[-1]} fibres; bars: one standard error by the bootstrap over unseen fibres.",
+        "by_fiber": f"Median and 99th percentile of the excess over all inclinations for each of {record['unseen']} "
+        "unseen fibres, by its largest absorption σ_a per fibre radius; hollow: elliptic sections. The "
+        f"99th percentile has its median at {tails[0]:.2g} for σ_a below 1, at {tails[1]:.2g} above.",
+    }
 
 
 def _spread(axis: Axes, data: Data) -> None:
@@ -62,7 +88,7 @@ def _curve(axis: Axes, data: Data) -> None:
 
 def _by_fiber(axis: Axes, data: Data) -> None:
     """Each unseen fibre at its largest absorption."""
-    largest = np.maximum(data.arrays["fiber.sigma_a"].max(-1), 5e-3)
+    largest = np.maximum(data.arrays["fiber.sigma_a"].max(-1), LEAST)
     value = 10 ** data.arrays["angle.trained.by_fiber.log10"]
     for k in range(data.record["unseen"]):
         face = COLORS[0] if data.arrays["fiber.eccentricity"][k] == 1 else "white"
@@ -72,7 +98,8 @@ def _by_fiber(axis: Axes, data: Data) -> None:
     for marker, face, label in (("o", COLORS[0], "median"), ("^", COLORS[0], "99th percentile"),
                                 ("s", COLORS[0], "round"), ("s", "white", "elliptic")):  # fmt: skip
         axis.plot([], [], marker, color=COLORS[0], mfc=face, ms=4.5, linestyle="none", label=label)
-    axis.set(xscale="log", yscale="log", xlabel="largest σ_a of the channels (left end: 0)")
+    axis.set(xscale="log", yscale="log", xlabel="largest σ_a of the channels, per fibre radius")
+    axis.set_xticks([LEAST, 0.01, 0.1, 1, 10], ["0", "0.01", "0.1", "1", "10"])
     axis.set_ylabel("excess of an unseen fibre, trained")
     axis.grid(True)
 

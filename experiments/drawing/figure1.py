@@ -26,6 +26,34 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
     return {"averages": _averages(data, page), "densities": _densities(data, page), "fits": _fits(data, page)}
 
 
+def captions(data: Data) -> dict[str, str]:
+    """What the figures show."""
+    record, arrays = data.record, data.arrays
+    presets, n = record["presets"], arrays["n"]
+    excess = {name: arrays[f"{name}.fit.excess"] for name in presets}
+    clear = [name for name in presets if np.isfinite(number(record["width"][name]["limit_deg"]))]
+    worst = max((float(excess[name].max()) for name in clear), default=float("nan"))
+    cosine = [float(arrays[f"{name}.fit.excess_cosine"][-1]) for name in presets]
+    back = [100 * number(record["claims"][name]["back_share_0"]) for name in presets]
+    slopes = ", ".join(f"{name} {number(record['width'][name]['slope']):.2f}" for name in presets)
+    return {
+        "averages": "Averaged attenuation of forward (a_f) and backward (a_b) scattering by one fibre, and the share "
+        "that goes back, over the inclination of the light. Lines: means over the channels, bands: from the least to "
+        "the largest channel. They carry the cosine of the incident light, as published, so that both vanish at ±90°. "
+        f"At 0° {presets[-1]} hair sends {back[-1]:.0f} % of what it scatters back, {presets[0]} hair {back[0]:.0f} %.",
+        "densities": "What n fibres leave of light that is the same from everywhere: the law a_f^n (filled) as a "
+        "density of the inclination, the Gaussian fitted to it (dashed), and the chapter's cosine law (33), which is "
+        "the same for every n (dotted); rows: fibres, means over channels; columns: n. Densities above "
+        f"{_TALLEST:g} per degree are cut, with their largest value. Where a_f has its peak in the middle, a_f^n "
+        "becomes a narrow Gaussian; where absorption is strong, most passes at grazing inclinations.",
+        "fits": f"Gaussians fitted to a_f^n for n = {n[0]:g} to {n[-1]:g}: width with the limit that the curvature of "
+        "the peak predicts (dotted), centre (hollow marks: at its bound), and excess over the least second moment, "
+        f"beside that of the cosine law (dotted); all by quadrature. Exponents of the width from "
+        f"n = {number(record['slope_from']):g} on: {slopes}. The Gaussian's excess is {worst:.2g} at most for "
+        f"{', '.join(clear)}; that of the cosine law is {min(cosine):.1f} to {max(cosine):.0f} at the largest n.",
+    }
+
+
 def _averages(data: Data, page: Page) -> Figure:
     """a_f, a_b and the share that goes back; bands from the least to the largest channel."""
     figure = page.figure(0.46)

@@ -29,6 +29,30 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
     return {**made, "weights": _weights(data, page)}
 
 
+def captions(data: Data) -> dict[str, str]:
+    """What the figures show."""
+    record, found = data.record, {}
+    for scene in sorted(record["scenes"]):
+        names, facts = _techniques(data, scene), record["scenes"][scene]
+        reference, seconds = facts["reference"], number(record["equal_seconds"])
+        told = ", ".join(f"{name} {_percent(facts['of'][name]['equal_time']['error'])}" for name in names)
+        found[f"pictures-{scene}"] = (
+            f"Block of {reference['strands']:,} blond strands under {_LIGHTS[scene]}, {reference['width']} × "
+            f"{reference['height']} pixels. Above: pictures after {seconds:g} s of one core for each technique, and "
+            f"their relative errors on a logarithmic scale; below: the middle with {record['equal_samples']} "
+            f"directions for every hit. Under the maps: root mean square of the relative error and FLIP, both against "
+            f"the reference ({reference['samples']:,} directions per hit, ±{_percent(reference['own_error'])}). Errors "
+            f"after equal time: {told}."
+        )
+    found["weights"] = (
+        "Why the pictures differ, a row for each light. Left: relative error of the picture against directions per "
+        "hit, measured (marks), and predicted from ∫F²/p at hits of some pixels (dashed). Middle: chance that the "
+        "weight of a sample, over its mean, is above w; right: part of the second moment that such weights carry. "
+        "Where it sits in weights too rare to be drawn, measured errors stay below what is predicted, until one comes."
+    )
+    return found
+
+
 def _image(data: Data, name: str) -> np.ndarray:
     from PIL import Image
 

@@ -33,6 +33,63 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
     return found
 
 
+def captions(data: Data) -> dict[str, str]:
+    """What the figures show."""
+    record = data.record
+    presets, methods = record["presets"], record["methods"]
+    count = len(data.arrays[f"{presets[0]}.contexts"])
+    medians = [np.median(data.arrays[f"{preset}.excess"], axis=0) for preset in presets]
+    of = {name: [row[methods.index(name)] for row in medians] for name in ("best mix", "fitted", "amortised")}
+    told = {name: " and ".join(f"{x:.2g}" for x in values) for name, values in of.items()}
+    sizes, context = record["timed_samples"], f"θ_r = {number(record['fixed_theta_r_deg']):g}°"
+    found = {
+        "excess": f"Excess over the least second moment at {count} contexts of each fibre, constant light, judged by "
+        "quadrature nodes that no fit has seen. Left: a dot for each context, bar: median; right: share of contexts "
+        "below. Optimal weights subtract control variates, so that their excess can be below 0; values below "
+        f"{FLOOR:.0e} are drawn there. Medians ({', '.join(presets)}): {told['best mix']} for the best mix of the "
+        f"chapter's proposals, {told['fitted']} for fits context by context, {told['amortised']} for one amortised "
+        "proposal.",
+        "time": f"Relative root mean square error against the median CPU time of one estimate, one thread, of "
+        f"{sizes[0]} to {sizes[-1]:,} samples (larger marks: more), at {context}, n = {number(record['fixed_n']):g}; "
+        f"bars: 95 % intervals from {record['timed_repeats']} estimates. Times leave out what comes before: the choice "
+        "of a mix, the fit, the training (see the table of costs). Marks above one another: there the fixed cost of a "
+        "call prevails over that of samples.",
+    }
+    steps = f"{len(record['theta_r_deg'])} inclinations and {len(record['n'])} numbers of fibres"
+    for preset in presets:
+        moves = [
+            50 * np.abs(np.diff(data.arrays[f"{preset}.theta_r.{kind}"].astype(float), axis=0)).sum(1).mean()
+            for kind in ("mix", "fitted")
+        ]
+        found[f"shares_{preset}"] = (
+            f"{preset.capitalize()} hair: shares of the lobes in the mixture of the chapter's proposals of least "
+            f"variance (top), in fits context by context (middle, dots: edges at {steps}) and in one amortised "
+            "proposal (bottom), over the inclination of the view (left) and n (right, v = exp(-n)). Pale: lobes "
+            f"widened by scattering among fibres. From one inclination to the next {moves[0]:.0f} % of the samples of "
+            f"the chapter's mix change lobe in the mean, and {moves[1]:.0f} % of the fit's."
+        )
+        found[f"shapes_{preset}"] = (
+            f"{preset.capitalize()} hair: mode (top) and width (bottom, root of the product of both sides) of the "
+            "longitudinal lobes over the inclination of the view (left) and n (right). Marks: fits context by context; "
+            f"lines: one amortised proposal; drawn only where a lobe has {100 * HEAVY:g} % of the samples or more. "
+            f"Over the inclination, the modes of both differ by {_gap(data, preset, 'TT'):.1f}° for TT and by "
+            f"{_gap(data, preset, 'R'):.1f}° for R, in the mean."
+        )
+    return found
+
+
+def _gap(data: Data, preset: str, lobe: str) -> float:
+    """Mean difference in degrees between the modes of fitted and amortised lobes, over inclinations where both are
+    heavy."""
+    g, key = data.record["groups"].index(lobe), f"{preset}.theta_r"
+    points, dense = np.array(data.record["theta_r_deg"], dtype=float), data.arrays[f"{key}.dense"]
+    line = np.interp(points, dense, data.arrays[f"{key}.amortised_shape"][:, g, 0])
+    share = np.interp(points, dense, data.arrays[f"{key}.amortised"][:, g])
+    heavy = np.minimum(share, data.arrays[f"{key}.fitted"][:, g]) >= HEAVY
+    gap = np.abs(line - data.arrays[f"{key}.shape"][:, g, 0])[heavy]
+    return float(gap.mean()) if len(gap) else float("nan")
+
+
 def tables(data: Data) -> list[Table]:
     """Excess over contexts, what it takes, and how near the amortised shares are to the fitted ones."""
     return [_summary(data), _costs(data), _agreement(data)]
@@ -81,13 +138,16 @@ def _time(data: Data, page: Page) -> Figure:
     for preset, axis in zip(presets, axes, strict=True):
         error, spread, seconds = (data.arrays[f"{preset}.timed.{key}"] for key in ("error", "error_se", "seconds"))
         for m in range(len(record["methods"])):
-            axis.errorbar(
-                1e3 * seconds[m], 100 * error[m], 196 * spread[m], marker=MARKERS[m], ms=3.2, lw=1.0, color=COLORS[m]
-            )
+            x, y, bars = 1e3 * seconds[m], 100 * error[m], 196 * spread[m]
+            axis.errorbar(x, y, bars, ls="-", lw=0.5, elinewidth=0.9, color=COLORS[m], alpha=0.7)
+            for k in range(len(x)):
+                axis.plot(x[k], y[k], MARKERS[m], ms=2.4 + 0.9 * k, mew=0, color=COLORS[m])
         axis.set(
             xscale="log", yscale="log", xlabel="CPU time of an estimate / ms", ylabel="relative error / %",
             title=f"{preset}, θ_r = {number(record['fixed_theta_r_deg']):g}°, n = {number(record['fixed_n']):g}",
         )  # fmt: skip
+        _plain_ticks(axis.xaxis)
+        _plain_ticks(axis.yaxis)
         axis.grid(True)
     handles = [
         Line2D([], [], color=COLORS[m], marker=MARKERS[m], ms=3.2, lw=1.0, label=name)
@@ -95,6 +155,13 @@ def _time(data: Data, page: Page) -> Figure:
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
     return figure
+
+
+def _plain_ticks(side: Any, subs: tuple[int, ...] = (1, 3)) -> None:
+    """Plain numbers on a logarithmic axis."""
+    side.set_minor_formatter(NullFormatter())
+    side.set_major_locator(LogLocator(subs=subs))
+    side.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
 
 
 def _slices(data: Data) -> list[tuple[str, np.ndarray, str, str]]:
@@ -165,9 +232,7 @@ def _shapes(data: Data, page: Page, preset: str) -> Figure:
         axes[0, column].set_title(fixed)
         axes[1, column].set_xlabel(label)
         axes[1, column].set_yscale("log")
-        axes[1, column].yaxis.set_minor_formatter(NullFormatter())
-        axes[1, column].yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
-        axes[1, column].yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        _plain_ticks(axes[1, column].yaxis, (1, 2, 3, 5))
     axes[0, 0].set_ylabel("mode of θ_h / °")
     axes[1, 0].set_ylabel("width / °")
     handles = [

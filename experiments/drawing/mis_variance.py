@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from dsfit.experiment.files import number
 from dsfit.experiment.plots.style import COLORS, MARKERS
@@ -20,6 +21,40 @@ MODELS = ("multi-sample", "one-sample")
 def figures(data: Data, page: Page) -> dict[str, Figure]:
     """Heuristics against each other, measurement against quadrature, and shares of the samples."""
     return {"heuristics": _heuristics(data, page), "measured": _measured(data, page), "shares": _shares(data, page)}
+
+
+def captions(data: Data) -> dict[str, str]:
+    """What the figures show."""
+    record, ratios = data.record, _ratios(data)
+    names, first = record["rules"], record["set_names"][0]
+    median = {name: np.median(ratios[:, 0, names.index(name), 0]) for name in ("maximum", "optimal")}
+    one = float(np.median(ratios[:, 0, names.index("balance"), 1]))
+    quick = float(np.median(_efficiencies(data)[:, 0, names.index("balance"), 1]))
+    z_variance, z_mean = _z(data)
+    plain = [k for k, name in enumerate(names) if name != "optimal"]
+
+    def best(rule: str) -> str:
+        exact = (data.arrays[f"pair{k}.exact"][names.index(rule), 0] for k in range(len(record["pairs"])))
+        return ", ".join(f"{data.arrays['shares'][np.argmin(row)]:.2f}" for row in exact)
+
+    each = f"{record['repeats']} estimates of {record['samples']:,} samples"
+    return {
+        "heuristics": f"Variance per sample (top) and variance times CPU time (bottom) of every weighting over those "
+        f"of multi-sample balance, for {len(record['set_names'])} sets of proposals (columns) with equal shares; a dot "
+        f"for each of {len(ratios)} contexts, bars: medians. Variances are exact, by quadrature; times as measured on "
+        f"one thread. With {first}: maximum {median['maximum']:.2g} and optimal {median['optimal']:.2g} times balance "
+        f"in the median, one-sample balance {one:.2g} times, and {quick:.2g} "
+        "times with the time that its samples take.",
+        "measured": f"Left: variance measured ({each}) over that by quadrature, for three weightings in both models, ± "
+        "one standard error; large errors belong to heavy-tailed weights. Right: deviations of measured variances "
+        "(without optimal, whose control variates are estimated) and means from quadrature in standard errors, with "
+        f"the normal density: root mean square {_rms(z_variance[:, :, plain]):.2f} and {_rms(z_mean):.2f}.",
+        "shares": f"Variance of pairs of proposals over the share of the samples that the first one gets, "
+        f"{record['pair_preset']} hair, θ_r = {number(record['pair_theta_r_deg']):g}°, in the multi-sample (top) and "
+        f"the one-sample model (bottom). Lines: quadrature; dots: measured, {each}, ± one standard error; stars: least "
+        "variance; diamonds: one proposal alone, where it is within the scale. Best shares in the "
+        f"multi-sample model: {best('balance')} for balance, {best('optimal')} for optimal.",
+    }
 
 
 def tables(data: Data) -> list[Table]:
@@ -60,7 +95,7 @@ def _heuristics(data: Data, page: Page) -> Figure:
         Line2D([], [], color=COLORS[m], marker="o", ls="", ms=4, label=f"{model} model")
         for m, model in enumerate(MODELS)
     ]
-    handles.append(Line2D([], [], color="0.2", marker="_", ls="", ms=10, mew=1.6, label="median over contexts"))
+    handles.append(Line2D([], [], color="0.2", marker="_", ls="", ms=7, mew=1.6, label="median over contexts"))
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     return figure
 
@@ -71,7 +106,7 @@ def _dots(axis: Any, values: np.ndarray, offset: float, color: str) -> None:
     spread = np.linspace(-0.11, 0.11, count) if count > 1 else np.zeros(1)
     for r in range(rules):
         axis.plot(r + offset + spread, values[:, r], "o", ms=2.2, color=color, alpha=0.65, mew=0)
-    axis.plot(np.arange(rules) + offset, np.median(values, axis=0), "_", ms=11, mew=1.6, color="0.2")
+    axis.plot(np.arange(rules) + offset, np.median(values, axis=0), "_", ms=7, mew=1.6, color="0.2")
 
 
 def _z(data: Data) -> tuple[np.ndarray, np.ndarray]:
@@ -129,9 +164,15 @@ def _shares(data: Data, page: Page) -> Figure:
             for share, alone in zip((1, 0), data.arrays[f"pair{k}.alone"], strict=True):
                 if alone < top:
                     axis.plot(share, alone, "D", ms=4, color="0.3", clip_on=False, zorder=6)
-            axis.set(yscale="log", xlim=(0, 1), ylim=(0.8 * np.nanmin(exact), top))
+            axis.set(yscale="log", xlim=(0, 1), xticks=(0, 0.5, 1), ylim=(0.8 * np.nanmin(exact), top))
+            few = top < 10 * np.nanmin(exact)  # less than a decade: more numbers on the axis
+            axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 4, 6) if few else (1, 3)))
+            axis.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
+            axis.yaxis.set_minor_formatter(NullFormatter())
             axis.grid(True)
-        names = "\n".join(name.replace("transmittance", "transm.") for name in (pair["first"], f"and {pair['second']}"))
+        names = "\n".join(
+            name.replace("transmittance_", "transm. ") for name in (pair["first"], f"and {pair['second']}")
+        )
         axes[0, k].set_title(f"{names}, n = {number(pair['n']):g}")
         axes[1, k].set_xlabel(f"share of {pair['first']}")
     for m, model in enumerate(MODELS):

@@ -13,6 +13,7 @@ from matplotlib.patches import Patch
 from dsfit.experiment.plots.style import COLORS
 from dsfit.figures import Data, Table
 from dsfit.figures.page import Page
+from experiments.drawing import _proposals_captions
 from experiments.drawing._proposals_maps import all_maps
 from experiments.drawing._proposals_tables import forms_table, maps_table, own_table
 
@@ -33,6 +34,11 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
     pages = list(dict.fromkeys(law["page"] for law in data.record["laws"]))
     found = {name: _laws(data, page, [law for law in data.record["laws"] if law["page"] == name]) for name in pages}
     return found | {"own": _own(data, page), "maps": all_maps(data, page)}
+
+
+def captions(data: Data) -> dict[str, str]:
+    """What the figures show."""
+    return _proposals_captions.captions(data)
 
 
 def tables(data: Data) -> list[Table]:

@@ -41,6 +41,53 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
     return made
 
 
+def captions(data: Data) -> dict[str, str]:
+    """What the figures show."""
+    record = data.record
+    seen = f"{record['preset']} hair seen from θ_r = {number(record['theta_r_deg']):g}°"
+    axes = "over the inclination θ_i and the azimuth φ of the light"
+    here = f"{seen}, φ_r = {number(record['phi_r_deg']):g}°"
+    sections, bent = _numbers(record["eccentricities"]), [e for e in _numbers(record["eccentricities"]) if e != 1]
+    rows = (
+        "Left: integrand over its integral; middle: density of the mixture fitted to it, on the same scale; right: "
+        "their ratio, the weight of a sample over the mean weight, with the excess over the least second moment and "
+        "the largest weight, by quadrature."
+    )
+    found = {
+        "integrands": f"Integrand |F| over its integral, {axes}, for sections of {len(sections)} eccentricities (rows) "
+        f"and n fibres in front (columns); {here}, constant light; one logarithmic scale of {DECADES} decades. "
+        "Scattering among fibres widens the lobes; the section shapes them most where nothing is in front.",
+        "against-round": f"Integrand of elliptic sections over that of the round one, each normalised, {axes}; {here}. "
+        f"White beyond the lobes: less than {_DARK:g} of the largest value, not divided. Beyond the ends of the scale "
+        "colours are cut.",
+    }
+    for section in sections:
+        worst = _worst(data, "matrix", section)
+        found[f"eccentricity-{section:g}"] = (
+            f"The fitted proposal {axes}, section of eccentricity {section:g}; a row for each n; {here}, constant "
+            f"light. {rows} The largest excess is {worst[0]:.1e}, the largest weight {worst[1]:.2f}; dark where |F| "
+            "is as good as 0."
+        )
+    if record["turned_phi_r_deg"] and bent:
+        worst, e = _worst(data, "turned"), number(record["turned_eccentricity"])
+        found["azimuths"] = (
+            f"The fitted proposal for views of different azimuth φ_r (rows) about a section of eccentricity {e:g}, "
+            f"{axes}; {seen}, n = {number(record['turned_n']):g}. {rows} The largest excess is {worst[0]:.1e}, the "
+            f"largest weight {worst[1]:.2f}."
+        )
+    return found
+
+
+def _worst(data: Data, which: str, section: float | None = None) -> tuple[float, float]:
+    """Largest excess and largest weight of fits."""
+    cells = [
+        cell["fitted"]
+        for key, cell in data.record["cells"].items()
+        if key.startswith(f"{which}.") and section in (None, number(cell["eccentricity"]))
+    ]
+    return tuple(max(number(cell[key]) for cell in cells) for key in ("excess", "largest_weight"))  # type: ignore
+
+
 def _numbers(values: Sequence[Any]) -> list[float]:
     return [number(x) for x in values]
 

@@ -43,6 +43,36 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
     return {"grid": grid, "lit": lit}
 
 
+def captions(data: Data) -> dict[str, str]:
+    """What the two figures show."""
+    arrays, record = data.arrays, data.record
+    r = _shown(data)
+    bias, scatter = 100 * arrays["counts.bias"][:, r], arrays["counts.scatter"][:, r]
+    poisson, rule = (arrays[f"counts.brier_{name}"][:, r, record["points"].index("fibres")]
+                     for name in ("poisson", "threshold"))  # fmt: skip
+    voxels, rays = record["resolutions"][r], f"{record['rays']:,} rays for each geometry and kind of points"
+    bars = "bars: one standard error (jackknife)"
+    return {
+        "grid": f"Numbers of fibres that rays cross, from a grid of densities (n) against exact ones of the geometry "
+        f"(N), over the resolution of the grid; {rays}, which start on fibres (filled) or where a camera sees them "
+        f"(hollow) and go in all directions; {bars}. Left: mean n over mean N less 1. Right: root mean square of N "
+        f"about its mean at given n, over that of Poisson numbers. At {voxels} voxels the bias lies between "
+        f"{bias.min():+.1f} % and {bias.max():+.1f} %, the scatter between {scatter.min():.2f} and "
+        f"{scatter.max():.2f} of Poisson's.",
+        "lit": f"Left: share of rays that cross no fibre against the n that a grid of {voxels} voxels expects, in bins "
+        f"of at least {LEAST_IN_BIN} rays; lines: the two rules for v, exp(-n) and 1 up to n = 1/2. Right: mean square "
+        f"error of v by either rule as a forecast of N = 0, over the resolution, points on fibres; {rays}, {bars}. At "
+        f"{voxels} voxels it is {poisson.min():.3f} to {poisson.max():.3f} with exp(-n), {rule.min():.3f} to "
+        f"{rule.max():.3f} with the threshold.",
+    }
+
+
+def _shown(data: Data) -> int:
+    """Index of the resolution that is nearest to `SHOWN`."""
+    resolutions = data.record["resolutions"]
+    return min(range(len(resolutions)), key=lambda k: abs(resolutions[k] - SHOWN))
+
+
 def _key(data: Data) -> list[Line2D]:
     names = [Line2D([], [], label=name.replace("_", " "), markersize=4, **look(k))
              for k, name in enumerate(data.record["geometries"])]  # fmt: skip
@@ -85,7 +115,7 @@ def _resolutions(axis: Axes, data: Data) -> None:
 def _uncrossed(axis: Axes, data: Data) -> None:
     """Share of rays with N = 0 against n, and exp(-n)."""
     arrays, resolutions = data.arrays, data.record["resolutions"]
-    r = min(range(len(resolutions)), key=lambda k: abs(resolutions[k] - SHOWN))
+    r = _shown(data)
     x = np.linspace(0, MOST_N, 100)
     axis.plot(x, np.exp(-x), color="black", linewidth=0.8)
     axis.step([0, 0.5, 0.5, MOST_N], [1, 1, 0, 0], color="black", linewidth=0.8, linestyle="--")

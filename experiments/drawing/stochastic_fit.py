@@ -26,6 +26,50 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
     }
 
 
+def captions(data: Data) -> dict[str, str]:
+    """What the figures show."""
+    arrays, record = data.arrays, data.record
+    scenes, seeds = record["scenes"], record["seeds"]
+    quiet = [(k, i) for k, i in enumerate(arrays["gauss_newton.scenes"]) if scenes[i]["noise"] is None]
+    ends = np.array(
+        [
+            np.median(10 ** arrays["gauss_newton.log10_excess"][k, :, -1]) / arrays["quadrature.excess"][i]
+            for k, i in quiet
+        ]
+    )
+    cost = np.array(
+        [
+            np.median(arrays["gauss_newton.evaluations"][k, :, -1]) / arrays["quadrature.evaluations"][i]
+            for k, i in quiet
+        ]
+    )
+    best = int(np.argmax(arrays["gradients.log10_factor"]))
+    factor, stream = (
+        10 ** arrays["gradients.log10_factor"][best],
+        np.median(10 ** arrays["stream.log10_median"], axis=0),
+    )
+    judged = "judged on finer quadrature nodes than any fit saw"
+    return {
+        "progress": f"Progress of Gauss-Newton fits to samples only, without noise: excess over that of the fit by "
+        f"quadrature, {judged}, against evaluations of the integrand (left) and seconds (right), both over those of "
+        f"the fit by quadrature with its nodes. Lines: medians of {seeds} seeds, bands: their range; a line below 1 "
+        f"left of 1 is better for less. After {' to '.join(f'{x:.2g}' for x in (cost.min(), cost.max()))} times the "
+        f"evaluations the excess is {ends.min():.2g} to {ends.max():.2g} times that of the quadrature fit.",
+        "noise": f"The same where the light is noisy: every answer is the radiance times a random factor, lognormal or "
+        f"0 or ten (roulette). Excess without the noise, {judged}; medians and ranges of {seeds} seeds, with one and "
+        "with two independent answers for each sample; Adam after as many evaluations as one answer. Black: the fit by "
+        "quadrature, which sees no noise; where a line stays at the start (dotted), no step was certain enough.",
+        "ends": f"Where all fits ended, {judged}: medians (marks) and ranges (lines) of {seeds} seeds; scenes: fibre, "
+        "inclination of the view, fibres in front, light (constant if none is named), noise. Gauss-Newton and Adam "
+        "have the same evaluations.",
+        "stream_gradients": f"Left: excess of one network trained on samples of a stream of contexts, at contexts not "
+        f"trained on, median and worst over contexts, which falls from {stream[0]:.2g} to {stream[-1]:.2g} in the "
+        "median. Right: how many times lower the variance of the gradient is with each device than with the plain "
+        f"estimator, at equal evaluations; bars: 95 % intervals by the bootstrap; at most {factor:.2g} times "
+        f"({record['plans'][best]}).",
+    }
+
+
 def _name(scene: dict[str, Any], noise: bool = True) -> str:
     light = "" if scene["light_width_deg"] is None else f", {scene['light_width_deg']:g}° light"
     tail = f", {scene['noise']}" if noise and scene["noise"] else ""
@@ -33,7 +77,8 @@ def _name(scene: dict[str, Any], noise: bool = True) -> str:
 
 
 def _progress(data: Data, page: Page) -> Figure:
-    """Excess over that of the quadrature fit: a colour a preset, a line a context; median and range of seeds."""
+    """Excess and cost over those of the quadrature fit, which is the point (1, 1): a colour a preset, a line a context;
+    median and range of seeds."""
     arrays, scenes = data.arrays, data.record["scenes"]
     figure = page.figure(0.66)
     axes = figure.subplots(1, 2, sharey=True)
@@ -43,19 +88,22 @@ def _progress(data: Data, page: Page) -> Figure:
     for k, i in rows:
         preset = scenes[i]["preset"]
         color, line = COLORS[presets.index(preset)], ("-", "--", "-.", ":")[seen[preset] % 4]
-        marker, seen[preset] = MARKERS[seen[preset] % len(MARKERS)], seen[preset] + 1
+        seen[preset] += 1
         ratio = 10 ** arrays["gauss_newton.log10_excess"][k] / arrays["quadrature.excess"][i]
         for axis, key in zip(axes, ("evaluations", "seconds"), strict=True):
-            x = np.median(arrays[f"gauss_newton.{key}"][k], axis=0)
+            x = np.median(arrays[f"gauss_newton.{key}"][k], axis=0) / arrays[f"quadrature.{key}"][i]
             label = _name(scenes[i]) if key == "evaluations" else None
             axis.plot(x, np.median(ratio, axis=0), color=color, linestyle=line, linewidth=1.2, label=label)
             axis.fill_between(x, ratio.min(0), ratio.max(0), color=color, alpha=0.1, linewidth=0)
-            axis.plot(arrays[f"quadrature.{key}"][i], 1.0, marker, color=color, markersize=4.5, markeredgecolor="white")
-    for axis, label in zip(axes, ("evaluations of the integrand", "seconds"), strict=True):
+    for axis, label in zip(
+        axes, ("evaluations / those of the quadrature fit", "time / that of the quadrature fit"), strict=True
+    ):
         axis.axhline(1.0, color="black", linewidth=0.8, zorder=0.5)
+        axis.axvline(1.0, color="black", linewidth=0.8, zorder=0.5)
+        axis.plot(1.0, 1.0, "D", color="black", markersize=4, label=None)
         axis.set(xscale="log", yscale="log", xlabel=label)
         _plain_log(axis)
-    axes[0].plot([], [], MARKERS[0], color="black", markersize=4.5, label="a mark at 1: fit by quadrature")
+    axes[0].plot([], [], "D", linestyle="none", color="black", markersize=4, label="fit by quadrature")
     axes[0].set_ylabel("excess / excess of the quadrature fit")
     figure.legend(loc="outside lower center", ncols=2, frameon=False)
     return figure

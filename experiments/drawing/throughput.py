@@ -39,8 +39,53 @@ def figures(data: Data, page: Page) -> dict[str, Figure]:
         found[name] = page.figure(height)
         axis = found[name].subplots()
         draw(axis, record)
-        found[name].legend(loc="outside lower center", ncols=3, frameon=False)
+        title = "threads, and contexts of directions" if name == "ratios" else None
+        found[name].legend(loc="outside lower center", ncols=3, frameon=False, title=title)
     return found
+
+
+def captions(data: Data) -> dict[str, str]:
+    """What the figures show."""
+    record = data.record
+    load, peer = record["load"], record["mitsuba"]
+    where = f"one thread bound to one of {load['cores']} cores"
+    what = (
+        f"Mitsuba {peer['version']} ({peer['variant']}) evaluates one fibre of four lobes, dsfit the same with roots "
+        "and caustic, and scattering among fibres"
+        if peer["variant"]
+        else "Mitsuba was not there to compare with"
+    )
+    rows = [(task, *pair) for task in ("eval", "fused") if (pair := _pair(record, task, "all different", 1))]
+    told = ", ".join(f"{rate(row) / rate(other):.2g} for {RATIO_NAMES[task]}" for task, row, other in rows)
+    told = told.replace("\n", " ")
+    return {
+        "rates": f"Million directions a second of processor time, {where}, each direction in a context of its own, for "
+        "the number of directions a call that suits each contender best; compiled and prepared before. Bars: medians; "
+        f"lines: 10th to 90th percentile of calls in turn. {what}.",
+        "directions": f"The same rates against the number of directions a call, {where}, for eval alone (lines) and "
+        "for sample, pdf and eval in one call (dashed). On the left the fixed cost of a call prevails, on the right "
+        "results no longer fit the caches; larger calls of slow contenders are left out.",
+        "ratios": "Rate of the compiled kernel over that of Mitsuba for the same number of directions, the most that "
+        "both did, by how directions share contexts and by threads; lines: from the 10th percentile of one over the "
+        "90th of the other to the reverse; above 1 the kernel is ahead. Mitsuba's eval takes contexts in, the kernel's "
+        f"has them prepared unless “prepare” is named. One thread, contexts all different: {told}.",
+        "limits": f"Left bars: time per direction that each resource would need by itself for the compiled kernel's "
+        "operations, counted, at the rates of this machine, measured with small loops; right bars: time measured, "
+        f"{where}, each direction in a context of its own. Measured times can be shorter than the sum, as resources "
+        "work at once, and longer, where something waits.",
+    }
+
+
+def _pair(record: dict[str, Any], task: str, layout: str, threads: int) -> tuple[Any, Any] | None:
+    """Rows of the compiled kernel and of Mitsuba for the most directions that both did."""
+    rows = index(record)
+    both = [
+        (row, other)
+        for key, row in rows.items()
+        if key[:3] == ("kernel, compiled", task, layout) and key[4] == threads
+        if (other := base(record, rows, task, key[3], threads)) is not None
+    ]
+    return max(both, key=lambda pair: pair[0]["count"]) if both else None
 
 
 def _bars(axis: Axes, record: dict[str, Any]) -> None:
@@ -81,37 +126,38 @@ def _curves(axis: Axes, record: dict[str, Any]) -> None:
 
 def _ratios(axis: Axes, record: dict[str, Any]) -> None:
     """Of the compiled kernel to Mitsuba, by task, layout and threads, each for the most directions that both did."""
-    rows = index(record)
     seen = {(row["threads"], row["layout"]) for row in record["rows"] if row["library"] == "kernel, compiled"}
     kinds = sorted(seen, key=lambda kind: (kind[0], kind[1] != "all different"))
     for k, (thread, layout) in enumerate(kinds):
-        label: str | None = f"{thread} thread{'s' if thread > 1 else ''}, {layout}"
+        label: str | None = f"{thread} thread{'s' if thread > 1 else ''}, {layout.replace(' a c', ' per c')}"
         for j, task in enumerate(RATIO_NAMES):
-            both = [
-                (row, other)
-                for key, row in rows.items()
-                if key[:3] == ("kernel, compiled", task, layout) and key[4] == thread
-                if (other := base(record, rows, task, key[3], thread)) is not None
-            ]
-            if not both:
+            pair = _pair(record, task, layout, thread)
+            if pair is None:
                 continue
-            row, other = max(both, key=lambda pair: pair[0]["count"])
+            row, other = pair
             value, at = rate(row) / rate(other), j + (k - (len(kinds) - 1) / 2) * 0.25
             ends = [rate(row, one) / rate(other, two) for one, two in (("high", "low"), ("low", "high"))]
             axis.bar(at, value, 0.25, color=COLORS[k], label=label)
             axis.vlines(at, *ends, color="black", linewidth=0.8)
+            axis.annotate(
+                f"{value:.2f}", (at, max(value, *ends)), (0, 1), textcoords="offset points", ha="center", fontsize=6
+            )
             label = None
-    axis.axhline(1.0, color="black", linewidth=0.8)
+    axis.axhline(1.0, color="black", linewidth=0.8, zorder=0.5)
     axis.set_xticks(range(len(RATIO_NAMES)), list(RATIO_NAMES.values()))
     axis.set_ylabel("rate of the compiled kernel / Mitsuba")
+    axis.margins(y=0.09)
 
 
 def _roofline(axis: Axes, record: dict[str, Any]) -> None:
     counts = record.get("counts", {})
     tasks = [task for task in TASKS if task in counts]
+    needed = {name for task in tasks for name, spent in bounds(record["machine"], counts[task]).items() if spent > 0}
     for j, task in enumerate(tasks):
         bottom = 0.0
         for k, (name, seconds) in enumerate(bounds(record["machine"], counts[task]).items()):
+            if name not in needed:
+                continue
             axis.bar(j - 0.2, 1e9 * seconds, 0.35, bottom=bottom, color=COLORS[k], label=None if j else name)
             bottom += 1e9 * seconds
         axis.bar(j + 0.2, measured(record, task), 0.35, color="#444444", label=None if j else "measured")
