@@ -152,7 +152,7 @@ def draw(entry: Entry, folder: Path, say: Callable[[str], None], look: Look, for
 
 
 def draw_figures(entry: Entry, data: Any, folder: Path, look: Look, origin: about.About) -> dict[str, dict[str, Any]]:
-    """Write every figure; returns caption and files of each, by name, in the order in which they were drawn."""
+    """Write every figure; returns caption, files and place in the order of drawing of each, by name."""
     from dsfit.experiment.plots.style import styled
     from dsfit.figures.page import Page
 
@@ -162,19 +162,20 @@ def draw_figures(entry: Entry, data: Any, folder: Path, look: Look, origin: abou
         for name, figure in entry.drawing.figures(data, page).items():
             written = page.save(figure, folder, name, {**origin, "figure": name}, pgf=look.pgf)
             caption = captions.get(name, entry.experiment.shows)
-            found[name] = {"caption": caption, "files": [f"figures/{path.name}" for path in written]}
+            files_of = [f"figures/{path.name}" for path in written]
+            found[name] = {"caption": caption, "files": files_of, "place": len(found)}
     return found
 
 
 def write_tables(entry: Entry, data: Any, folder: Path) -> dict[str, dict[str, Any]]:
-    """Write every table as Markdown and LaTeX; returns caption and files of each, by name, in order."""
+    """Write every table as Markdown and LaTeX; returns caption, files and place in the order of each, by name."""
     found = {}
     for table in entry.drawing.tables(data):
         label = f"tab:{entry.name}:{table.name}"
         for suffix, text in (("md", table.markdown()), ("tex", table.latex(label))):
             files.write_bytes(folder / f"{table.name}.{suffix}", text.encode())
         names = [f"tables/{table.name}.{suffix}" for suffix in ("md", "tex")]
-        found[table.name] = {"caption": table.caption, "files": names}
+        found[table.name] = {"caption": table.caption, "files": names, "place": len(found)}
     return found
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -53,6 +54,17 @@ def read_state(path: Path) -> dict[str, Any]:
 def write_state(path: Path, state: dict[str, Any]) -> None:
     """Write a state file."""
     files.write_json(path, {"schema_version": SCHEMA_VERSION, **state})
+
+
+def in_order(drawn: Any) -> list[str]:
+    """Names of figures or tables of a state file, whose keys are sorted, in the order in which they were drawn; those
+    of unknown place last."""
+
+    def place(name: str) -> tuple[int, str]:
+        found = drawn[name].get("place") if isinstance(drawn[name], dict) else None
+        return (found if isinstance(found, int) else sys.maxsize, name)
+
+    return sorted(drawn, key=place) if isinstance(drawn, dict) else []
 
 
 def has_data(folder: Path) -> bool:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dsfit.figures.latex import escape
+from dsfit.figures.state import in_order
 
 _PREAMBLE = r"""% Compile with pdflatex (twice) in this folder.
 \documentclass[11pt,a4paper]{article}
@@ -53,8 +54,8 @@ def _section(name: str, drawn: Mapping[str, Any]) -> str:
         f"{escape(drawn['shows'])} Made by \\texttt{{dsfit figures run {escape(name, symbols=False)}}}.",
         _reproduced(drawn["reproduces"]),
     ]
-    parts += [_figure(name, figure, one["caption"]) for figure, one in drawn["figures"].items()]
-    parts += [rf"\input{{{name}/tables/{table}.tex}}" for table in drawn["tables"]]
+    parts += [_figure(name, figure, drawn["figures"][figure]["caption"]) for figure in in_order(drawn["figures"])]
+    parts += [rf"\input{{{name}/tables/{table}.tex}}" for table in in_order(drawn["tables"])]
     return "\n\n".join(parts) + "\n"
 
 

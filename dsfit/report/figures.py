@@ -9,6 +9,7 @@ from typing import Any
 
 from dsfit.experiment.files import to_toml
 from dsfit.figures.latex import escape
+from dsfit.figures.state import in_order
 from dsfit.report import environment, markdown
 from dsfit.report.environment import items, mapping
 from dsfit.report.links import Place
@@ -36,10 +37,10 @@ def figures_page(out: Path, place: Place, root: Path) -> Page:
 
 
 def _files_of(one: Standing, kind: str, suffix: str) -> list[Path]:
-    """Its figures or tables by name, those that were drawn and are gone among them."""
-    drawn = [str(name) for name in mapping(one.drawn.get(kind))]
-    known = {one.folder / kind / f"{name}{suffix}" for name in drawn if "/" not in name and "\0" not in name}
-    return sorted(known | {*one.folder.glob(f"{kind}/*{suffix}")})
+    """Its figures or tables in the order in which they were drawn, those that are gone among them, then others."""
+    drawn = in_order(mapping(one.drawn.get(kind)))
+    known = [one.folder / kind / f"{name}{suffix}" for name in drawn if "/" not in name and "\0" not in name]
+    return [*known, *sorted({*one.folder.glob(f"{kind}/*{suffix}")} - {*known})]
 
 
 def _pictures(one: Standing) -> list[Path]:

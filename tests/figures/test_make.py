@@ -14,6 +14,7 @@ from dsfit.figures import Data, state
 from dsfit.figures.catalogue import BrokenExperiment, Entry, find, names
 from dsfit.figures.data import read_data, write_data
 from dsfit.figures.make import Look, is_up_to_date, make
+from dsfit.figures.thesis import thesis
 
 
 def quiet(what: str) -> None:
@@ -47,6 +48,20 @@ def test_made_once_then_up_to_date(toy: Entry, tmp_path: Path):
     assert {"figures/curve.png", "figures/curve.pdf", "tables/values.md", "tables/values.tex"} < set(
         contents(tmp_path / "toy_a")
     )
+
+
+def test_the_order_of_drawing_is_kept(add, tmp_path: Path):
+    draw = """second, first = page.figure(0.5), page.figure(0.5)
+    second.subplots(), first.subplots()
+    return {"z_first": first, "curve": figure, "a_last": second}"""
+    entry = find(add("toy_a", draw=draw), "toy_a")
+    make(entry, tmp_path, say=quiet)
+    drawn = state.read_state(tmp_path / "toy_a" / "drawn.json")
+    wanted = ["z_first", "curve", "a_last"]
+    assert state.in_order(drawn["figures"]) == wanted
+    text = thesis({"toy_a": drawn})
+    assert sorted(wanted, key=lambda name: text.index(f"fig:toy_a:{name}")) == wanted
+    assert state.in_order({"b": {}, "a": {"place": "?"}, "c": {"place": 0}}) == ["c", "a", "b"]
 
 
 def test_two_computations_and_two_drawings_give_the_same_bytes(toy: Entry, tmp_path: Path):
