@@ -43,10 +43,10 @@ def captions(
         f"and has at most {pairs[:, 4].max():.3g} times the variance of the better one.",
         "bad": f"What a second, bad proposal (colours; V: its variance alone) does to {record['good']} (grey: alone), "
         f"{where} hair, first context. Left: variance by quadrature over the share of the samples of the bad one; "
-        "averages are drawn only where they are below 1000, and are infinite for the others. Right: what one measures "
-        f"with equal shares of {growth[0]} to {growth[-1]:,} samples, medians of the estimated variance over repeats, "
-        "bars from the lower to the upper quartile: where the average's variance is infinite, what is seen grows with "
-        "N, or looks harmless until a rare large weight comes.",
+        "averages of a bad one with V above 1000 are far beyond the scale or infinite, and not drawn. Right: what one "
+        f"measures with equal shares of {growth[0]} to {growth[-1]:,} samples, medians of the estimated variance over "
+        "repeats, bars from the lower to the upper quartile: where the average's variance is infinite, what is seen "
+        "grows with N, or looks harmless until a rare large weight comes.",
         "time": f"Relative root mean square error against the CPU time of one estimate (median), one thread, of "
         f"{sizes[0]} to {sizes[-1]:,} samples; bars: 95 % intervals from {record['timed_repeats']} estimates. On the "
         "left the fixed cost of a call prevails, which is why more samples take hardly more time there. To the same "

@@ -69,10 +69,14 @@ def costs_figure(data: Data, page: Page) -> Figure:
     """Two panels of dots, a row for each cell."""
     cells = [data.record["cells"][name] for name in data.record["order"]]
     found = [costs(cell) for cell in cells]
+    labels = [
+        f"{cell['preset']}, {cell['context'][0]:g}°, {cell['context'][1]:g}, {cell['context'][2]:g}" for cell in cells
+    ]
     figure = page.figure(max(0.45, 0.2 + 0.032 * len(cells)))
     figure.set_layout_engine(None)  # by hand: tick labels are longer than the automatic layout expects
     height = figure.get_size_inches()[1]
-    figure.subplots_adjust(left=0.2, right=0.98, top=1 - 0.28 / height, bottom=0.75 / height, wspace=0.06)
+    left = 0.035 + 0.0086 * max(len(label) for label in labels)
+    figure.subplots_adjust(left=left, right=0.98, top=1 - 0.28 / height, bottom=0.75 / height, wspace=0.06)
     each, integral = figure.subplots(1, 2, sharey=True)
     rows = np.arange(len(cells))
     chain = np.array([one.chain_each for one in found])
@@ -82,13 +86,10 @@ def costs_figure(data: Data, page: Page) -> Figure:
         label="walkers, ± 2 standard errors",
     )  # fmt: skip
     each.plot([one.proposal_each for one in found], rows, "s", color=COLORS[1], markersize=4, label="fitted proposal")
-    each.set(xscale="log", xlabel="evaluations of |F| for an effective sample", xlim=(0.7, None))
+    each.set(xscale="log", xlabel="evaluations for an effective sample", xlim=(0.7, None))
     integral.plot([one.chain_integral for one in found], rows, "o", color=COLORS[0], markersize=4)
     integral.plot([one.proposal_integral for one in found], rows, "s", color=COLORS[1], markersize=4)
-    integral.set(xscale="log", xlabel=f"evaluations for ∫ |F| dω to {ACCURACY:.1%}")
-    labels = [
-        f"{cell['preset']}, {cell['context'][0]:g}°, {cell['context'][1]:g}, {cell['context'][2]:g}" for cell in cells
-    ]
+    integral.set(xscale="log", xlabel=f"evaluations for ∫|F| to {100 * ACCURACY:g} %")
     each.set_yticks(rows, labels, fontsize=7)
     each.set_title("rows: fibre, θ_r, n, v", fontsize=7, loc="left")
     each.invert_yaxis()

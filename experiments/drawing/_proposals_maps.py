@@ -47,7 +47,9 @@ def all_maps(data: Data, page: Page) -> Figure:
             panel.imshow(values, origin="lower", extent=(-180, 180, -90, 90), norm=norm, cmap=colors, aspect="auto")
             panel.set(xticks=(-180, 0, 180), yticks=(-90, 0, 90))
             panel.tick_params(labelsize=6, length=2)
-        panels[0].set_title(names[k].replace("_", " "), fontsize=7, loc="left", pad=2)
+        panels[0].set_title(
+            names[k] if names[k].startswith("M") else names[k].replace("_", " "), fontsize=7, loc="left", pad=2
+        )
     for panel in axes[-1] if len(names) == rows * _BLOCKS else [*axes[-1, :3], *axes[-2, 3:]]:
         panel.tick_params(labelbottom=True)
         panel.set_xlabel("φ / °", fontsize=6, labelpad=1)

@@ -59,7 +59,8 @@ def _laws(data: Data, page: Page, laws: list[dict]) -> Figure:
     ]
     if any(f"{law['name']}.target" in data.arrays for law in laws):
         handles.append(Line2D([], [], color=WANTED, linestyle="--", label="what the law is for"))
-    figure.legend(handles=handles, loc="lower center", ncols=4, frameon=False)
+    size = _SMALL if len(handles) > 3 else None
+    figure.legend(handles=handles, loc="lower center", ncols=4, frameon=False, fontsize=size)
     return figure
 
 

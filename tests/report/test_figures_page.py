@@ -49,8 +49,9 @@ def test_an_experiment_has_figures_tables_command_rules_and_latex(experiments: E
     page = page_of(*experiments)
     made = section(page, "page_made <i>and</i> more").blocks
     pictures = [block for block in made if isinstance(block, Picture)]
-    assert [p.name for p in pictures] == ["First", "Second"] and pictures[1].caption.startswith("The second figure's")
-    assert pictures[0].caption == "" and "What page_made shows" in pictures[0].alt  # the text above says so already
+    assert [p.name for p in pictures] == ["Second", "First"]  # as drawn
+    assert pictures[0].caption.startswith("The second figure's")
+    assert pictures[1].caption == "" and "What page_made shows" in pictures[1].alt  # the text above says so already
     (table,) = [block for block in made if isinstance(block, Table)]
     assert table.rows == [["a|b <script>", "1.0"], ["c", "-20.5"]] and table.align == "lr"
     assert table.caption == "What the numbers are." and [link.name for link in table.links] == ["Markdown", "LaTeX"]
