@@ -57,10 +57,13 @@ def captions(data: Data) -> dict[str, str]:
         "integrands": f"Integrand |F| over its integral, {axes}, for sections of {len(sections)} eccentricities (rows) "
         f"and n fibres in front (columns); {here}, constant light; one logarithmic scale of {DECADES} decades. "
         "Scattering among fibres widens the lobes; the section shapes them most where nothing is in front.",
-        "against-round": f"Integrand of elliptic sections over that of the round one, each normalised, {axes}; {here}. "
-        f"White beyond the lobes: less than {_DARK:g} of the largest value, not divided. Beyond the ends of the scale "
-        "colours are cut.",
     }
+    if 1.0 in sections and bent:
+        found["against-round"] = (
+            f"Integrand of elliptic sections over that of the round one, each normalised, {axes}; {here}. White beyond "
+            f"the lobes: less than {_DARK:g} of the largest value, not divided. Beyond the ends of the scale colours "
+            "are cut."
+        )
     for section in sections:
         worst = _worst(data, "matrix", section)
         found[f"eccentricity-{section:g}"] = (
@@ -68,7 +71,7 @@ def captions(data: Data) -> dict[str, str]:
             f"light. {rows} The largest excess is {worst[0]:.1e}, the largest weight {worst[1]:.2f}; dark where |F| "
             "is as good as 0."
         )
-    if record["turned_phi_r_deg"] and bent:
+    if record["turned_phi_r_deg"]:
         worst, e = _worst(data, "turned"), number(record["turned_eccentricity"])
         found["azimuths"] = (
             f"The fitted proposal for views of different azimuth φ_r (rows) about a section of eccentricity {e:g}, "

@@ -58,22 +58,27 @@ def captions(data: Data) -> dict[str, str]:
     rows = [(task, *pair) for task in ("eval", "fused") if (pair := _pair(record, task, "all different", 1))]
     told = ", ".join(f"{rate(row) / rate(other):.2g} for {RATIO_NAMES[task]}" for task, row, other in rows)
     told = told.replace("\n", " ")
-    return {
+    found = {
         "rates": f"Million directions a second of processor time, {where}, each direction in a context of its own, for "
         "the number of directions a call that suits each contender best; compiled and prepared before. Bars: medians; "
         f"lines: 10th to 90th percentile of calls in turn. {what}.",
         "directions": f"The same rates against the number of directions a call, {where}, for eval alone (lines) and "
         "for sample, pdf and eval in one call (dashed). On the left the fixed cost of a call prevails, on the right "
         "results no longer fit the caches; larger calls of slow contenders are left out.",
-        "ratios": "Rate of the compiled kernel over that of Mitsuba for the same number of directions, the most that "
-        "both did, by how directions share contexts and by threads; lines: from the 10th percentile of one over the "
-        "90th of the other to the reverse; above 1 the kernel is ahead. Mitsuba's eval takes contexts in, the kernel's "
-        f"has them prepared unless “prepare” is named. One thread, contexts all different: {told}.",
         "limits": f"Left bars: time per direction that each resource would need by itself for the compiled kernel's "
         "operations, counted, at the rates of this machine, measured with small loops; right bars: time measured, "
         f"{where}, each direction in a context of its own. Measured times can be shorter than the sum, as resources "
         "work at once, and longer, where something waits.",
     }
+    if peer["variant"]:
+        found["ratios"] = (
+            "Rate of the compiled kernel over that of Mitsuba for the same number of directions, the most that both "
+            "did, by how directions share contexts and by threads; lines: from the 10th percentile of one over the "
+            "90th of the other to the reverse; above 1 the kernel is ahead. Mitsuba's eval takes contexts in, the "
+            "kernel's has them prepared unless “prepare” is named. One thread, contexts all different: "
+            f"{told}."
+        )
+    return found
 
 
 def _pair(record: dict[str, Any], task: str, layout: str, threads: int) -> tuple[Any, Any] | None:

@@ -18,6 +18,7 @@ from dsfit.figures import Close, Data, Estimate, Measured, agreement, reference
 from dsfit.figures.catalogue import Entry, find, names
 from dsfit.figures.data import read_data, write_data
 from dsfit.figures.experiment import Work
+from dsfit.figures.latex import escape
 from dsfit.figures.make import Look, draw_figures, write_tables
 from dsfit.figures.page import Page
 from dsfit.figures.thesis import thesis
@@ -121,6 +122,10 @@ def test_it_draws_reference_data_as_wide_as_the_page(name: str):
         assert one.get_size_inches()[1] < 235 / 25.4, "higher than a page"
     tables = entry.drawing.tables(data)
     assert figures or tables
+    captions = getattr(entry.drawing, "captions", lambda data: {})(data)
+    assert set(captions) == set(figures), "a caption for every figure"
+    for text in captions.values():
+        assert len(text) > 80 and "[U+" not in escape(text) and not {"nan", "inf", "nan."} & set(text.split())
     for table in tables:
         assert table.caption.strip() and table.rows and all(isinstance(x, str) for row in table.rows for x in row)
         assert "[U+" not in table.latex()
