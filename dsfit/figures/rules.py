@@ -21,7 +21,8 @@ class Close:
     atol: float = 0.0
 
     def __str__(self) -> str:
-        return f"within {self.rtol:g} (relative)" + (f" + {self.atol:g}" if self.atol else "")
+        parts = [f"{self.rtol:g} (relative)"] * bool(self.rtol) + [f"{self.atol:g}"] * bool(self.atol)
+        return "within " + (" + ".join(parts) or "0")
 
 
 @dataclass(frozen=True)
