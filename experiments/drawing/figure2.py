@@ -38,8 +38,8 @@ def captions(data: Data) -> dict[str, str]:
         told = ", ".join(f"{name} {_percent(facts['of'][name]['equal_time']['error'])}" for name in names)
         found[f"pictures-{scene}"] = (
             f"Block of {reference['strands']:,} blond strands under {_LIGHTS[scene]}, {reference['width']} × "
-            f"{reference['height']} pixels. Above: pictures after {seconds:g} s of one core for each technique, and "
-            f"their relative errors on a logarithmic scale; below: the middle with {record['equal_samples']} "
+            f"{reference['height']} pixels. Above: pictures after about {seconds:g} s of one core, as many directions per hit as a trial gave to "
+            f"expect in that time, and their relative errors on a logarithmic scale; below: the middle with {record['equal_samples']} "
             f"directions for every hit. Under the maps: root mean square of the relative error and FLIP, both against "
             f"the reference ({reference['samples']:,} directions per hit, ±{_percent(reference['own_error'])}). Errors "
             f"after equal time: {told}."
@@ -75,14 +75,15 @@ def _pictures(data: Data, page: Page, scene: str) -> Figure:
         axis.set(xticks=[], yticks=[])
         axis.spines[:].set_visible(False)
     seconds, samples = number(data.record["equal_seconds"]), data.record["equal_samples"]
-    heads = {"equal_time": f"{seconds:g} s each", "equal_samples": f"{samples} per hit"}
+    heads = {"equal_time": f"about {seconds:g} s", "equal_samples": f"{samples} per hit"}
     for column, name in enumerate(names):
         axes[0, column].set_title(_broken(name), fontsize=8)
         for row, which in enumerate(heads):
             facts = found["of"][name][which]
             _show(axes[2 * row, column], _image(data, f"{scene}.{name}.{which}"))
             _error_map(axes[2 * row + 1, column], _image(data, f"{scene}.{name}.{which}.map"))
-            axes[2 * row, column].set_xlabel(f"{facts['samples']:,} per hit", fontsize=7, labelpad=2)
+            took = f"{facts['samples']:,} per hit, {number(facts['seconds']):.1f} s"
+            axes[2 * row, column].set_xlabel(took, fontsize=7, labelpad=2)
             text = f"{_percent(facts['error'])}, FLIP {number(facts['flip']):.3f}"
             axes[2 * row + 1, column].set_xlabel(text, fontsize=7, labelpad=2)
     for row, text in enumerate(heads.values()):
