@@ -135,7 +135,9 @@ Estimator = Callable[[int, torch.Generator], Tensor]
 def error_and_seconds(
     estimator: Estimator, integral: Tensor, samples: int, repeats: int, seed: int
 ) -> tuple[float, float, float]:
-    """Relative root mean squared error of one estimate, its standard error, and median CPU seconds."""
+    """Relative root mean squared error of one estimate, its standard error, and median CPU seconds once warm."""
+    for _ in range(2):
+        estimator(samples, torch.Generator().manual_seed(seed))
     generator, found = torch.Generator().manual_seed(seed), []
     seconds = median_seconds(lambda: found.append(estimator(samples, generator)), repeats)
     squares = (torch.stack(found) - integral).square().sum(-1) / integral.square().sum()

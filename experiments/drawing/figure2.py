@@ -38,10 +38,11 @@ def captions(data: Data) -> dict[str, str]:
         told = ", ".join(f"{name} {_percent(facts['of'][name]['equal_time']['error'])}" for name in names)
         found[f"pictures-{scene}"] = (
             f"Block of {reference['strands']:,} blond strands under {_LIGHTS[scene]}, {reference['width']} × "
-            f"{reference['height']} pixels. Above: pictures after about {seconds:g} s of one core, "
-            "as many directions per hit as a trial gave to expect in that time, and their relative errors on a "
-            f"logarithmic scale; below: the middle with {record['equal_samples']} directions for every hit. Under the maps: root mean square of the relative error and FLIP, both "
-            f"against the reference ({reference['samples']:,} directions per hit, ±{_percent(reference['own_error'])}). Errors "
+            f"{reference['height']} pixels. Above: pictures after about {seconds:g} s of one core, as many directions "
+            "per hit as a trial gave to expect in that time, and their relative errors on a logarithmic scale; below: "
+            f"the middle with {record['equal_samples']} directions for every hit. Under the maps: root mean square of "
+            "the relative error and FLIP, both against the reference "
+            f"({reference['samples']:,} directions per hit, ±{_percent(reference['own_error'])}). Errors "
             f"after equal time: {told}."
         )
     found["weights"] = (
