@@ -77,7 +77,7 @@ EXPERIMENT = Experiment(
     "about 0.001 in the median, a hundredth at worst.",
     settings=Amortised,
     compute=compute,
-    minutes=6,
+    minutes=7.4,
     reproduces={
         "*.seconds": Measured(),
         "*.start": Close(1e-3, 1e-6),

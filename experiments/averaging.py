@@ -152,7 +152,7 @@ EXPERIMENT = Experiment(
     "and of the best proposal, and what one bad proposal does to each.",
     settings=Averaging,
     compute=compute,
-    minutes=1.5,
+    minutes=1.3,
     reproduces={
         "average_at": Close(0.0),
         "single": Close(1e-3),

@@ -69,7 +69,7 @@ EXPERIMENT = Experiment(
     "the joint density of the walkers under contours of |F|, the integral by bridge sampling, and what each costs.",
     settings=EmceeAgreement,
     compute=compute,
-    minutes=3.0,
+    minutes=2.5,
     needs=("emcee", "arviz_stats"),
     reproduces={
         "cells.*.p.*": Measured(),  # new with every seed

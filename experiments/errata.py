@@ -72,7 +72,7 @@ EXPERIMENT = Experiment(
     "per cent, some are no densities at all.",
     settings=Errata,
     compute=compute,
-    minutes=0.6,
+    minutes=0.3,
     reproduces={
         "decades": Close(0.05),  # of p-values of fixed samples, and of quadratures
         "ratio": Close(1e-4),

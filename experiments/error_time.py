@@ -79,7 +79,7 @@ EXPERIMENT = Experiment(
     "contexts; what the fit costs, and from when on it pays.",
     settings=ErrorTime,
     compute=compute,
-    minutes=18,
+    minutes=5.1,
     reproduces={
         "time.*": Measured(),
         "per_sample.*": Measured(),

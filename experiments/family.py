@@ -154,7 +154,7 @@ EXPERIMENT = Experiment(
     "training, the untrained start and the best mix of the chapter's proposals.",
     settings=Family,
     compute=compute,
-    minutes=12,
+    minutes=8.1,
     reproduces={
         "*seconds*": Measured(),
         "worst.*": Measured(),  # extremes of one training, as are single pairs

@@ -129,7 +129,7 @@ EXPERIMENT = Experiment(
     "cosθ/2 (33) and the fitted Gaussian; width, centre and excess over n; the caption's claims in numbers.",
     settings=Figure1,
     compute=compute,
-    minutes=0.8,
+    minutes=0.5,
     needs=("jax", "optimistix"),
     reproduces={
         "*.fit.excess*": Close(1e-4, 1e-8),

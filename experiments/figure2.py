@@ -223,7 +223,7 @@ EXPERIMENT = Experiment(
     "converged reference; errors measured and predicted, and the tail of the weights that tells why.",
     settings=Figure2,
     compute=compute,
-    minutes=5,
+    minutes=4.0,
     needs=("embreex", "PIL"),
     reproduces={
         "weights": Close(1e-12),

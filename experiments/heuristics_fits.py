@@ -219,7 +219,7 @@ EXPERIMENT = Experiment(
     "widths of their lobes as functions of inclination and number of fibres.",
     settings=HeuristicsFits,
     compute=compute,
-    minutes=5.0,
+    minutes=5.4,
     reproduces={
         "*.contexts": Close(1e-12),
         "*.dense": Close(1e-12),

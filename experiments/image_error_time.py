@@ -171,7 +171,7 @@ EXPERIMENT = Experiment(
     "many times as long others take to equal error.",
     settings=ImageErrorTime,
     compute=compute,
-    minutes=35,
+    minutes=33.0,
     reproduces={
         "scenes.*.at_equal_time.*": Measured(),
         "*.error": Estimate("*.standard_error"),

@@ -141,7 +141,7 @@ EXPERIMENT = Experiment(
     "quadrature and measured, per sample and per second.",
     settings=MisVariance,
     compute=compute,
-    minutes=2.7,
+    minutes=2.3,
     reproduces={
         "exact": Close(1e-3),
         "quadrature_error": MeasuredRule(),

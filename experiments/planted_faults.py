@@ -62,7 +62,7 @@ EXPERIMENT = Experiment(
     shows="Which slips in the library the checks find, and the few that no check can see.",
     settings=PlantedFaults,
     compute=compute,
-    minutes=2,
+    minutes=1.6,
     reproduces={"decades": Close(0.15), "deviation": Close(0.1)},
     small=('faults=["back-exponent", "azimuth-half", "unseen-parameter"]',),
 )

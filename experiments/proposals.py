@@ -142,7 +142,7 @@ EXPERIMENT = Experiment(
     "components, and maps of all proposals over (θ_i, φ) with samples and residuals.",
     settings=Proposals,
     compute=compute,
-    minutes=1.0,
+    minutes=0.6,
     reproduces={
         "own.distance": Estimate("own.distance_error", most=_ANY),
         "distance": Estimate("distance_error", most=_ANY),

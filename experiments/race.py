@@ -72,7 +72,7 @@ EXPERIMENT = Experiment(
     "at single ones.",
     settings=Race,
     compute=compute,
-    minutes=13,
+    minutes=11.0,
     reproduces={
         "first.rmse": Estimate("first.error"),
         "points": Measured(),

@@ -168,7 +168,7 @@ EXPERIMENT = Experiment(
     "best heuristic mix and of the fit.",
     settings=ResponseMaps,
     compute=compute,
-    minutes=4.5,
+    minutes=4.0,
     needs=("jax", "optimistix"),
     reproduces={
         "cells.*.seconds.*": Measured(),

@@ -201,7 +201,7 @@ EXPERIMENT = Experiment(
     "cross none, and the two rules for the lit share v.",
     settings=ScatterCounts,
     compute=compute,
-    minutes=5,
+    minutes=1.4,
     reproduces={
         "speed.*": Measured(),
         "bins.zero": Estimate(error="error.bins.zero", most=math.inf),

@@ -83,7 +83,7 @@ EXPERIMENT = Experiment(
     "formula as first written down would have lost.",
     settings=StabilityAtlas,
     compute=compute,
-    minutes=3,
+    minutes=2.7,
     reproduces={
         # Rounding differs with the instruction set, single errors by 14 times and more: none may be a hundred times
         # what is stored. That all are within their stated limits (`beyond`) is held exactly.

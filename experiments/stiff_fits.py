@@ -73,7 +73,7 @@ EXPERIMENT = Experiment(
     shows="How much of the way to the best value each solver goes from bad starts, and that none says what is false.",
     settings=StiffFits,
     compute=compute,
-    minutes=2.5,
+    minutes=2.0,
     reproduces={
         # The paths of badly posed fits amplify rounding. Held are the shares of problems, and, exactly, that there is
         # no false claim (`faults`).

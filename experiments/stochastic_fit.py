@@ -191,7 +191,7 @@ EXPERIMENT = Experiment(
     "quadrature; with noisy light; one network over a stream of contexts; variance of gradients.",
     settings=StochasticFit,
     compute=compute,
-    minutes=7,
+    minutes=6.0,
     reproduces={
         "*seconds": Measured(),
         "start": Close(1e-5),

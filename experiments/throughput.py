@@ -92,7 +92,7 @@ EXPERIMENT = Experiment(
     shows="Directions per second and core: dsfit's kernels against Mitsuba 3's hair and the machine's limits.",
     settings=Throughput,
     compute=compute,
-    minutes=4,
+    minutes=1.4,
     reproduces={
         "counts.*": Close(1e-3),  # of operations; some depend on what is drawn
         "*": Measured(),
