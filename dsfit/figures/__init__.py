@@ -7,23 +7,28 @@ An experiment is a module of the folder `experiments`: `experiments/NAME.py` say
 
 from __future__ import annotations
 
-from dsfit.experiment.about import read_about
-from dsfit.experiment.sections import Section as Settings
-from dsfit.figures.data import Data
-from dsfit.figures.experiment import Experiment, Work
-from dsfit.figures.rules import Close, Estimate, Exact, Measured, Rule
-from dsfit.figures.table import Table
+import importlib
+from typing import Any
 
-__all__ = [
-    "Close",
-    "Data",
-    "Estimate",
-    "Exact",
-    "Experiment",
-    "Measured",
-    "Rule",
-    "Settings",
-    "Table",
-    "Work",
-    "read_about",
-]
+_PUBLIC = {
+    "Close": "dsfit.figures.rules",
+    "Data": "dsfit.figures.data",
+    "Estimate": "dsfit.figures.rules",
+    "Exact": "dsfit.figures.rules",
+    "Experiment": "dsfit.figures.experiment",
+    "Measured": "dsfit.figures.rules",
+    "Rule": "dsfit.figures.rules",
+    "Settings": "dsfit.experiment.sections",
+    "Table": "dsfit.figures.table",
+    "Work": "dsfit.figures.experiment",
+    "read_about": "dsfit.experiment.about",
+}
+
+__all__ = sorted(_PUBLIC)
+
+
+def __getattr__(name: str) -> Any:
+    """Names are loaded when first used: the command line imports this package at every start."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'dsfit.figures' has no attribute {name!r}")
+    return getattr(importlib.import_module(_PUBLIC[name]), "Section" if name == "Settings" else name)

@@ -2,6 +2,15 @@
 
 from __future__ import annotations
 
-from dsfit.report.write import write_report
+from typing import Any
 
 __all__ = ["write_report"]
+
+
+def __getattr__(name: str) -> Any:
+    """Loaded when first used: the command line imports this package at every start."""
+    if name != "write_report":
+        raise AttributeError(f"module 'dsfit.report' has no attribute {name!r}")
+    from dsfit.report.write import write_report
+
+    return write_report
